@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pinhole cameras: rays out of cells, points into images.
+
+Image coordinates run from (0, 0), the top-left corner of the top-left pixel, to (W, H) (COLMAP's
+convention). Cameras are OpenCV: x right, y down, z forward.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from raytran.errors import ShapeError, check_shape
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """A set of pinhole cameras that share an image size.
+
+    Attributes:
+        intrinsics: ``(..., 3, 3)`` for images of ``image_size``, pixels.
+        world_from_camera: ``(..., 4, 4)``.
+        image_size: ``(H, W)``.
+
+    Raises:
+        ShapeError: a tensor has another shape, or the leading shapes differ.
+    """
+
+    intrinsics: Tensor
+    world_from_camera: Tensor
+    image_size: tuple[int, int]
+
+    def __post_init__(self) -> None:
+        check_shape(self.intrinsics, "... 3 3", "intrinsics")
+        check_shape(self.world_from_camera, "... 4 4", "world_from_camera")
+        if self.intrinsics.shape[:-2] != self.world_from_camera.shape[:-2]:
+            raise ShapeError(
+                "expected as many intrinsics as poses, got "
+                f"{tuple(self.intrinsics.shape[:-2])} and {tuple(self.world_from_camera.shape[:-2])}"
+            )
+
+    @property
+    def position(self) -> Tensor:
+        """``(..., 3)`` optical centres in the world."""
+        return self.world_from_camera[..., :3, 3]
+
+    def scaled_to(self, image_size: tuple[int, int]) -> Cameras:
+        """Return the cameras of the same images resized to ``image_size`` ``(H', W')``.
+
+        The first row of K is scaled by W'/W and the second by H'/H, so the resize need not keep the aspect.
+        """
+        height, width = image_size
+        factor = [width / self.image_size[1], height / self.image_size[0], 1.0]
+        rows = torch.tensor(factor, dtype=self.intrinsics.dtype, device=self.intrinsics.device)
+        return Cameras(self.intrinsics * rows[:, None], self.world_from_camera, (height, width))
+
+    def cell_rays(self, feature_size: tuple[int, int], rays_per_cell: int = 1) -> tuple[Tensor, Tensor]:
+        """Cast rays through the cells of an ``h × w`` map laid over the image.
+
+        A cell is cut into n×n equal parts and a ray goes through the centre of each; with n = 1 the ray of
+        cell (r, c) passes through u = (c+½)·W/w, v = (r+½)·H/h.
+
+        Args:
+            feature_size: ``(h, w)``.
+            rays_per_cell: n.
+
+        Returns:
+            origins ``(..., 1, 1, 1, 3)`` and directions ``(..., h, w, n·n, 3)`` in the world; the directions
+            have unit depth along the camera's z axis, so a ray parameter is a depth in metres.
+        """
+        height, width = feature_size
+        scaled = self.scaled_to((height, width))
+        n = rays_per_cell
+        like = {"dtype": self.intrinsics.dtype, "device": self.intrinsics.device}
+        part = (torch.arange(n, **like) + 0.5) / n
+        v = torch.arange(height, **like)[:, None, None, None] + part[:, None]
+        u = torch.arange(width, **like)[None, :, None, None] + part
+        v, u = torch.broadcast_tensors(v, u)
+        image = torch.stack([u, v, torch.ones_like(u)], dim=-1).reshape(-1, 3)
+        world_from_image = self.world_from_camera[..., :3, :3] @ torch.linalg.inv(scaled.intrinsics)
+        rays = torch.einsum("...ij,kj->...ki", world_from_image, image)
+        directions = rays.unflatten(-2, (height, width, n * n))
+        return self.position[..., None, None, None, :], directions
+
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Project world points into the images.
+
+        Args:
+            points: ``(..., n, 3)`` metres, leading dimensions broadcast against the cameras'.
+
+        Returns:
+            pixels ``(..., n, 2)`` as (u, v), and depths ``(..., n)`` in metres. Pixels of points at or behind
+            the camera plane (depth ≤ 0) have no meaning.
+        """
+        rotation = self.world_from_camera[..., :3, :3]
+        in_camera = (points - self.position[..., None, :]) @ rotation
+        in_image = in_camera @ self.intrinsics.transpose(-1, -2)
+        depth = in_camera[..., 2]
+        return in_image[..., :2] / in_image[..., 2:].where(in_image[..., 2:] != 0, 1.0), depth

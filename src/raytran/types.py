@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The parcels that cross folders: what a batch, a network output and a prediction hold.
+
+Shape letters, used in every docstring of the project:
+
+====== =============================================== ====== ==================================
+``B``  scenes in a batch                               ``X Y Z`` voxels along the world's axes
+``N``  views (video frames) of a scene                 ``C``     channels of a feature
+``H W`` rows and columns of an image                   ``P``     pixel-voxel pairs
+``h w`` rows and columns of a feature map (stride 16)  ``Q``     object queries
+``M``  objects                                         ``K``     classes without padding (9)
+``S``  cells along one side of a shape grid (63)       ``L``     decoder layers
+====== =============================================== ====== ==================================
+
+Metres, radians; world right-handed with +Z up; cameras OpenCV (x right, y down, z forward); objects in
+ShapeNet's frame (+Y up, front -Z). ``CONVENTIONS.md`` says all of this at length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+CLASSES: tuple[str, ...] = (
+    "bathtub",
+    "bookshelf",
+    "cabinet",
+    "chair",
+    "display",
+    "sofa",
+    "table",
+    "trashbin",
+    "other",
+)
+"""Class names in the order of their labels; a network adds the padding class behind them (RayTran §3.2)."""
+
+PADDING: int = len(CLASSES)
+"""Label of the padding class: the query slot holds no object."""
+
+SHAPE_SIZE: int = 63
+"""Cells along each side of an object's shape grid (RayTran §3.2)."""
+
+SYMMETRY_INFINITE: int = 0
+"""Value of ``ObjectSet.symmetry`` for a body of revolution; 1, 2 and 4 are the number of equal turns."""
+
+_Parcel = TypeVar("_Parcel", bound="Parcel")
+
+
+@dataclass(frozen=True)
+class Parcel:
+    """A frozen dataclass of tensors (or of parcels, or tuples of them) that moves between devices as one."""
+
+    def to(self: _Parcel, device: torch.device | str, *, non_blocking: bool = False) -> _Parcel:
+        """Return a copy with every tensor inside on ``device``."""
+
+        def move(value: Any) -> Any:
+            if isinstance(value, Tensor | Parcel):
+                return value.to(device, non_blocking=non_blocking)
+            return tuple(move(item) for item in value) if isinstance(value, tuple) else value
+
+        return replace(self, **{field.name: move(getattr(self, field.name)) for field in fields(self)})
+
+    def pin_memory(self: _Parcel) -> _Parcel:
+        """Return a copy with every tensor inside in page-locked memory (called by ``DataLoader``)."""
+
+        def pin(value: Any) -> Any:
+            if isinstance(value, Tensor | Parcel):
+                return value.pin_memory()
+            return tuple(pin(item) for item in value) if isinstance(value, tuple) else value
+
+        return replace(self, **{field.name: pin(getattr(self, field.name)) for field in fields(self)})
+
+
+@dataclass(frozen=True)
+class Views(Parcel):
+    """Posed images of ``B`` scenes.
+
+    Attributes:
+        images: ``(B, N, 3 or 4, H, W)`` RGB, uint8 in [0, 255] or floating point in [0, 1]; a fourth
+            channel is a foreground mask given as input (RayTran §4, "Perfect segmentation").
+        intrinsics: ``(B, N, 3, 3)`` camera matrices for images of size ``H × W``, in pixels.
+        world_from_camera: ``(B, N, 4, 4)`` poses.
+    """
+
+    images: Tensor
+    intrinsics: Tensor
+    world_from_camera: Tensor
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """``(H, W)`` of the images."""
+        return self.images.shape[-2], self.images.shape[-1]
+
+
+@dataclass(frozen=True)
+class ObjectSet(Parcel):
+    """The ``M`` objects of one scene, true or predicted, in the world of the scene's poses.
+
+    Attributes:
+        label: ``(M,)`` int64, index into ``CLASSES``.
+        center: ``(M, 3)`` centre of the object's box, metres.
+        size: ``(M, 3)`` full extents along the object's own axes (x width, y height, z depth), metres.
+        rotation: ``(M, 3, 3)`` world_from_object; of an upright object ``Rz(yaw) · B`` (``geometry.rotation``).
+        symmetry: ``(M,)`` int64, number of equal turns about the object's up axis: 1, 2, 4, or
+            ``SYMMETRY_INFINITE``. All ones for predictions.
+        score: ``(M,)`` confidence in [0, 1]; ones for ground truth.
+        shape: ``(M, S, S, S)`` or None, occupancy over the object's own box, indexed [x, y, z] in the object
+            frame; cell ``i`` spans ``[i/S - ½, (i+1)/S - ½] · size``. bool for ground truth, probability
+            in [0, 1] for predictions.
+        model_id: ``catid/id`` of each object's CAD model, or empty.
+    """
+
+    label: Tensor
+    center: Tensor
+    size: Tensor
+    rotation: Tensor
+    symmetry: Tensor
+    score: Tensor
+    shape: Tensor | None = None
+    model_id: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return int(self.label.shape[0])
+
+    def select(self, index: Tensor) -> ObjectSet:
+        """Return the objects at ``index``, an int64 ``(M',)`` or bool ``(M,)`` tensor, in that order."""
+        chosen = torch.arange(len(self), device=index.device)[index].tolist()
+        return ObjectSet(
+            label=self.label[index],
+            center=self.center[index],
+            size=self.size[index],
+            rotation=self.rotation[index],
+            symmetry=self.symmetry[index],
+            score=self.score[index],
+            shape=None if self.shape is None else self.shape[index],
+            model_id=tuple(self.model_id[i] for i in chosen) if self.model_id else (),
+        )
+
+    @staticmethod
+    def empty() -> ObjectSet:
+        """Return a set of no objects."""
+        none = torch.zeros(0, dtype=torch.int64)
+        vectors = torch.zeros(0, 3)
+        return ObjectSet(none, vectors, vectors, torch.zeros(0, 3, 3), none, torch.zeros(0))
+
+
+@dataclass(frozen=True)
+class SceneBatch(Parcel):
+    """Input and targets of ``B`` scenes. Targets that were not asked for are None.
+
+    Attributes:
+        scene_id: name of each scene, e.g. ``scene0470_00``.
+        views: the posed images.
+        frame_id: per scene, the name of each frame's file without its ending.
+        grid_center: ``(B, 3)`` centre of each scene's voxel grid, metres: the mean camera position.
+        objects: the annotated objects of each scene.
+        occupancy: ``(B, X, Y, Z)`` bool, voxel holds part of an object.
+        foreground: ``(B, N, H, W)`` bool, amodal mask of all objects together.
+    """
+
+    scene_id: tuple[str, ...]
+    views: Views
+    frame_id: tuple[tuple[str, ...], ...]
+    grid_center: Tensor
+    objects: tuple[ObjectSet, ...] | None = None
+    occupancy: Tensor | None = None
+    foreground: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class RawObjects(Parcel):
+    """Output of one decoder layer for every query slot.
+
+    Attributes:
+        class_logits: ``(B, Q, K + 1)``, padding last.
+        center: ``(B, Q, 3)`` box centre in the world, metres.
+        log_size: ``(B, Q, 3)`` natural logarithm of the sizes in metres.
+        yaw_vector: ``(B, Q, 2)`` (sin, cos) of the yaw, not normalised.
+        embedding: ``(B, Q, C)`` query embedding, from which shapes are decoded.
+    """
+
+    class_logits: Tensor
+    center: Tensor
+    log_size: Tensor
+    yaw_vector: Tensor
+    embedding: Tensor
+
+
+@dataclass(frozen=True)
+class RawScene(Parcel):
+    """What the network returns for the tasks it was asked to do; None for the others.
+
+    Attributes:
+        grid_center: ``(B, 3)`` centre of the voxel grids used, metres.
+        occupancy: ``(B, X, Y, Z)`` logits.
+        foreground: ``(B, N, H, W)`` logits.
+        objects: one ``RawObjects`` per decoder layer, last layer last.
+    """
+
+    grid_center: Tensor
+    occupancy: Tensor | None = None
+    foreground: Tensor | None = None
+    objects: tuple[RawObjects, ...] | None = None
+
+
+@dataclass(frozen=True)
+class ScenePrediction(Parcel):
+    """The result for one scene.
+
+    Attributes:
+        scene_id: name of the scene.
+        objects: predicted objects, highest score first, with ``shape`` probabilities if they were decoded.
+        grid_center: ``(3,)`` centre of the voxel grid, metres.
+        occupancy: ``(X, Y, Z)`` probability, or None.
+        foreground: ``(N, H, W)`` probability, or None.
+    """
+
+    scene_id: str
+    objects: ObjectSet
+    grid_center: Tensor
+    occupancy: Tensor | None = None
+    foreground: Tensor | None = None
