@@ -1,0 +1,43 @@
+# Everything a person or CI does with the project; `make help` lists it.
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+
+.DEFAULT_GOAL := help
+.PHONY: help install demo test test-fast lint format clean
+
+help:  ## Show this list
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1|\2/' | column -t -s '|'
+
+install: $(VENV)/.installed  ## Make the virtual environment in .venv with everything that development needs
+
+# torch first: any other package that asks for it would take the newest build, gigabytes of CUDA included.
+$(VENV)/.installed: pyproject.toml requirements/ci.txt
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \
+		{ echo "raytran needs Python 3.11 to 3.13; name one with: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet "$$(grep '^torch==' requirements/ci.txt)"
+	$(BIN)/pip install --quiet --requirement requirements/ci.txt
+	$(BIN)/pip install --quiet --no-deps --editable .
+	@touch $@
+
+demo: install  ## Make rooms, train the three stages, evaluate, predict, and write one page to look at (CPU, minutes)
+	$(BIN)/python -m raytran.demo
+
+test: install  ## Run all tests
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal
+
+test-fast: install  ## Run the tests that take less than ten seconds each
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal -m 'not slow'
+
+lint: install  ## Check format, style and types
+	$(BIN)/ruff format --check src tests benchmarks
+	$(BIN)/ruff check src tests benchmarks
+	$(BIN)/mypy
+
+format: install  ## Rewrite the sources in the project's format
+	$(BIN)/ruff format src tests benchmarks
+	$(BIN)/ruff check --fix src tests benchmarks
+
+clean:  ## Remove the virtual environment and caches (not data/, not outputs/)
+	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache dist build
