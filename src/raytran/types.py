@@ -37,6 +37,19 @@ CLASSES: tuple[str, ...] = (
 )
 """Class names in the order of their labels; a network adds the padding class behind them (RayTran §3.2)."""
 
+CLASS_COLORS: tuple[tuple[int, int, int], ...] = (
+    (23, 190, 207),
+    (140, 86, 75),
+    (255, 127, 14),
+    (31, 119, 180),
+    (148, 103, 189),
+    (214, 39, 40),
+    (44, 160, 44),
+    (227, 119, 194),
+    (127, 127, 127),
+)
+"""Red, green, blue in [0, 255] of each class, in the order of ``CLASSES``: one colour for pictures and meshes."""
+
 PADDING: int = len(CLASSES)
 """Label of the padding class: the query slot holds no object."""
 
