@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading and resizing the images of a scan, some of which may be damaged."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+from torch import Tensor
+
+from raytran.errors import DataError
+
+_LOG = logging.getLogger(__name__)
+
+MIN_VIEWS = 2
+"""Fewest different frames from which a scene is reconstructed."""
+
+_UNREADABLE = (OSError, SyntaxError, ValueError)
+"""What Pillow raises for files that are truncated, damaged or no images."""
+
+
+def read_image(path: Path, image_size: tuple[int, int], *, stored: tuple[int, int] | None = None) -> Tensor:
+    """Read an image and resize it, not keeping its aspect.
+
+    Args:
+        path: a JPEG or PNG file.
+        image_size: ``(H, W)`` wanted.
+        stored: ``(H, W)`` that the file must have, or None for any.
+
+    Returns:
+        ``(3, H, W)`` uint8 RGB.
+
+    Raises:
+        DataError: the file is truncated, damaged, or of another size than ``stored``.
+    """
+    height, width = image_size
+    try:
+        with Image.open(path) as image:
+            if stored is not None and image.size != stored[::-1]:
+                raise DataError(
+                    f"{path} is {image.size[0]}x{image.size[1]}, not {stored[1]}x{stored[0]} as the others"
+                )
+            # A JPEG decodes at ½, ¼ or ⅛ of its size for less time, as long as that is no less than asked for.
+            image.draft("RGB", (width, height))
+            pixels = image.convert("RGB").resize((width, height), Image.Resampling.BILINEAR)
+    except _UNREADABLE as error:
+        raise DataError(f"cannot read the image {path} ({error}): copy or export it again") from error
+    return torch.from_numpy(np.array(pixels)).permute(2, 0, 1).contiguous()
+
+
+def read_images(
+    paths: Sequence[Path],
+    chosen: Sequence[int],
+    *,
+    image_size: tuple[int, int],
+    stored: tuple[int, int],
+    min_views: int = MIN_VIEWS,
+) -> tuple[Tensor, list[int]]:
+    """Read the chosen images; an unreadable one is replaced by the nearest one not yet taken.
+
+    If all images are taken the nearest readable one comes twice, so the number of images stays N.
+
+    Args:
+        paths: every image of the scan.
+        chosen: positions of N of them.
+        image_size: ``(H, W)`` wanted.
+        stored: ``(H, W)`` of the files.
+        min_views: fewest different images, or as many as were chosen if that is less.
+
+    Returns:
+        ``(N, 3, H, W)`` uint8 and the N positions that were read.
+
+    Raises:
+        DataError: fewer than ``min_views`` different images can be read.
+    """
+    read: dict[int, Tensor] = {}
+    failed: dict[int, DataError] = {}
+
+    def can_read(position: int) -> bool:
+        if position not in read and position not in failed:
+            try:
+                read[position] = read_image(paths[position], image_size, stored=stored)
+            except DataError as error:
+                failed[position] = error
+        return position in read
+
+    good = [position for position in chosen if can_read(position)]
+    for position in (position for position in chosen if position in failed):
+        neighbours = sorted(range(len(paths)), key=lambda other, here=position: abs(other - here))
+        fresh = (other for other in neighbours if other not in good and can_read(other))
+        again = (other for other in neighbours if other in good)
+        good.extend([other for other in [next(fresh, next(again, None))] if other is not None])
+    if failed:
+        first = next(iter(failed.values()))
+        _LOG.warning("skipped %d unreadable images of %s: %s", len(failed), paths[0].parent.parent, first)
+    if len(set(good)) < min(min_views, len(chosen)):
+        raise DataError(
+            f"only {len(set(good))} of {len(paths)} usable frames in {paths[0].parent} can be read and {min_views} "
+            "are needed: copy or export them again"
+        )
+    used = sorted(good)
+    return torch.stack([read[position] for position in used]), used
+
+
+def stored_size(paths: Sequence[Path]) -> tuple[int, int]:
+    """Return ``(H, W)`` of the first image whose header can be read.
+
+    Raises:
+        DataError: there is none.
+    """
+    for path in paths:
+        try:
+            with Image.open(path) as image:
+                return image.size[1], image.size[0]
+        except _UNREADABLE:
+            continue
+    raise DataError(f"no image in {paths[0].parent} can be read: copy or export them again")

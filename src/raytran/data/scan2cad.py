@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scan2CAD's ``full_annotations.json``: which CAD models stand where in a scan."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from raytran.errors import DataError
+from raytran.geometry.rotation import matrix_from_quaternion
+from raytran.types import CLASSES, SYMMETRY_INFINITE, ObjectSet
+
+_LOG = logging.getLogger(__name__)
+
+CLASS_BY_CATID: dict[str, str] = {
+    "02808440": "bathtub",
+    "02871439": "bookshelf",
+    "02933112": "cabinet",
+    "03001627": "chair",
+    "03211117": "display",
+    "04256520": "sofa",
+    "04379243": "table",
+    "02747177": "trashbin",
+}
+"""Class of each ShapeNet category (Scan2CAD EvaluateBenchmark.py); every other category is ``other``."""
+
+_SYMMETRY = {
+    "__SYM_NONE": 1,
+    "__SYM_ROTATE_UP_2": 2,
+    "__SYM_ROTATE_UP_4": 4,
+    "__SYM_ROTATE_UP_INF": SYMMETRY_INFINITE,
+}
+
+_SMALLEST_SCALE = 1e-3
+"""Models with a smaller scale along any axis are mistakes of annotation (ODAM skips the same)."""
+
+_THINNEST = 1e-3
+"""Least size of a box, metres: a CAD model may be a flat sheet, and sizes are compared by their logarithm."""
+
+
+@dataclass(frozen=True)
+class SceneAnnotation:
+    """The M CAD models of one scan, in the order of the file.
+
+    Attributes:
+        scene_id: name of the scan.
+        model_id: ``catid/id`` of each model in ShapeNet.
+        scan_from_cad: ``(M, 4, 4)`` float64, inv(M_scan) · T R S.
+        box_center: ``(M, 3)`` float64, centre of the model's box in CAD coordinates.
+        box_half_size: ``(M, 3)`` float64, half extents of that box.
+        symmetry: ``(M,)`` int64, 1, 2, 4 or ``SYMMETRY_INFINITE``.
+    """
+
+    scene_id: str
+    model_id: tuple[str, ...]
+    scan_from_cad: Tensor
+    box_center: Tensor
+    box_half_size: Tensor
+    symmetry: Tensor
+
+
+def read_annotations(path: Path) -> dict[str, SceneAnnotation]:
+    """Read an annotation file.
+
+    Args:
+        path: ``full_annotations.json``.
+
+    Returns:
+        the scenes by name; scenes without models are among them.
+
+    Raises:
+        DataError: the file is missing, no JSON, or an entry lacks a field.
+    """
+    try:
+        entries = json.loads(Path(path).read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"cannot read the annotations {path} ({error.strerror}): check the path") from error
+    except ValueError as error:
+        raise DataError(f"{path} is not valid JSON ({error}): copy it again") from error
+    scenes: dict[str, SceneAnnotation] = {}
+    try:
+        for entry in entries:
+            scenes[str(entry["id_scan"])] = _scene(entry)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise DataError(
+            f"entry {len(scenes)} of {path} is not as in Scan2CAD's full_annotations.json "
+            f"({type(error).__name__}: {error}): copy the file again"
+        ) from error
+    return scenes
+
+
+def scene_objects(annotation: SceneAnnotation) -> ObjectSet:
+    """Return a scene's objects in the scan frame, the world of the scan's poses.
+
+    With M = inv(M_scan) · T R S the centre is M · (box centre), the size the box times the lengths of M's
+    columns, and the rotation M's columns at length one. Models with a scale below 1 mm a unit are left out.
+
+    Args:
+        annotation: one scene of ``read_annotations``.
+
+    Returns:
+        M objects without shapes.
+    """
+    pose = annotation.scan_from_cad
+    scale = pose[:, :3, :3].norm(dim=1)
+    keep = (scale >= _SMALLEST_SCALE).all(dim=1)
+    if not keep.all():
+        _LOG.warning("%s: skipped %d models with a degenerate scale", annotation.scene_id, int((~keep).sum()))
+    classes = [CLASS_BY_CATID.get(name.split("/")[0], "other") for name in annotation.model_id]
+    center = pose[:, :3, :3] @ annotation.box_center[..., None] + pose[:, :3, 3:]
+    return ObjectSet(
+        label=torch.tensor([CLASSES.index(name) for name in classes], dtype=torch.int64),
+        center=center[..., 0].float(),
+        size=(2 * annotation.box_half_size * scale).clamp(min=_THINNEST).float(),
+        rotation=(pose[:, :3, :3] / scale[:, None]).float(),
+        symmetry=annotation.symmetry,
+        score=torch.ones(len(pose)),
+        model_id=annotation.model_id,
+    ).select(keep)
+
+
+def _scene(entry: dict[str, Any]) -> SceneAnnotation:
+    models = entry["aligned_models"]
+    return SceneAnnotation(
+        scene_id=str(entry["id_scan"]),
+        model_id=tuple(f"{model['catid_cad']}/{model['id_cad']}" for model in models),
+        scan_from_cad=torch.linalg.inv(_matrices([entry["trs"]]))
+        @ _matrices([model["trs"] for model in models]),
+        box_center=_vectors([model["center"] for model in models], 3),
+        box_half_size=_vectors([model["bbox"] for model in models], 3),
+        symmetry=torch.tensor([_SYMMETRY[model["sym"]] for model in models], dtype=torch.int64),
+    )
+
+
+def _matrices(trs: Sequence[dict[str, Sequence[float]]]) -> Tensor:
+    """Return T · R · S of each, ``(M, 4, 4)`` float64; quaternions are [w, x, y, z]."""
+    matrices = torch.eye(4, dtype=torch.float64).repeat(len(trs), 1, 1)
+    rotation = matrix_from_quaternion(_vectors([part["rotation"] for part in trs], 4))
+    matrices[:, :3, :3] = rotation * _vectors([part["scale"] for part in trs], 3)[:, None]
+    matrices[:, :3, 3] = _vectors([part["translation"] for part in trs], 3)
+    return matrices
+
+
+def _vectors(rows: Sequence[Sequence[float]], length: int) -> Tensor:
+    vectors = torch.tensor(rows, dtype=torch.float64).reshape(len(rows), length)
+    if not vectors.isfinite().all():
+        raise ValueError("a number is not finite")
+    return vectors
