@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The first voxel features V⁰: the mean of the pixel features whose rays pass a voxel (RayTran §3.1)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from raytran.errors import check_shape
+from raytran.ops.pairs import PairList, PairOrder
+from raytran.ops.segment import sparse_product
+
+
+def splat_features(features: Tensor, pairs: PairList) -> tuple[Tensor, Tensor]:
+    """Average over each voxel the features of the pixels paired with it.
+
+    Half-precision input is computed in float32.
+
+    Args:
+        features: ``(num_pixels, C)``.
+        pairs: which pixel sees which voxel.
+
+    Returns:
+        ``(num_voxels, C)`` in the dtype of ``features``, zeros for a voxel with no pair; and ``seen``
+        ``(num_voxels,)`` bool, whether it has one.
+
+    Raises:
+        ShapeError: the number of pixels is not that of ``pairs``.
+    """
+    check_shape(features, f"{pairs.num_pixels} C", "features")
+    dtype = torch.promote_types(features.dtype, torch.float32)
+    by_voxel, by_pixel = pairs.by("voxels"), pairs.by("pixels")
+    with torch.autocast(features.device.type, enabled=False):
+        mean = _Splat.apply(features.to(dtype), by_voxel, by_pixel)
+    return mean.to(features.dtype), by_voxel.row_offsets.diff() > 0
+
+
+class _Splat(torch.autograd.Function):
+    """Sum and divide; backward, divide and sum along the other side's rows."""
+
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, by_voxel: PairOrder, by_pixel: PairOrder) -> Tensor:
+        ctx.save_for_backward(*by_voxel, *by_pixel)
+        ones = features.new_ones(by_voxel.col_index.shape)
+        return sparse_product(ones, features, by_voxel) / _counts(by_voxel, features)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        by_voxel, by_pixel = PairOrder(*ctx.saved_tensors[:3]), PairOrder(*ctx.saved_tensors[3:])
+        with torch.autocast(grad.device.type, enabled=False):
+            ones = grad.new_ones(by_pixel.col_index.shape)
+            return sparse_product(ones, grad / _counts(by_voxel, grad), by_pixel), None, None
+
+
+def _counts(order: PairOrder, like: Tensor) -> Tensor:
+    """Return the number of pairs of each row, at least one, ``(rows, 1)``."""
+    return order.row_offsets.diff().clamp_(min=1).to(like.dtype)[:, None]
