@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The RayTran backbone: images and pixel-voxel pairs → voxel features and pixel features (RayTran §3.1)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from raytran.backbone.block import RayTracedBlock
+from raytran.backbone.resnet import ResNet18
+from raytran.errors import ConfigError, ShapeError, check_shape
+from raytran.ops.pairs import PairList
+from raytran.ops.splat import splat_features
+
+STRIDE = 16
+"""Image pixels along each side of a feature cell."""
+
+
+class Backbone(nn.Module):
+    """ResNet-18 per view, features averaged into voxels, then ``num_blocks`` 2D⇔3D blocks.
+
+    Args:
+        resnet: the image encoder.
+        channels: C of the 2D and 3D representations.
+        num_heads: attention heads of each block.
+        num_blocks: number of blocks n.
+        expansion: hidden channels of the blocks' feed-forwards, as a multiple of C.
+
+    Raises:
+        ConfigError: ``channels`` is not a multiple of ``num_heads``, or there is no block.
+    """
+
+    image_mean: Tensor
+    image_std: Tensor
+
+    def __init__(
+        self,
+        *,
+        resnet: ResNet18,
+        channels: int = 256,
+        num_heads: int = 8,
+        num_blocks: int = 4,
+        expansion: int = 2,
+    ) -> None:
+        super().__init__()
+        if channels % num_heads or num_blocks < 1:
+            raise ConfigError(
+                "backbone needs channels divisible by num_heads and a block at least, got "
+                f"channels={channels}, num_heads={num_heads}, num_blocks={num_blocks}"
+            )
+        self.channels = channels
+        self.resnet = resnet
+        self.projection = nn.Linear(resnet.out_channels, channels)
+        self.unseen = nn.Parameter(0.02 * torch.randn(channels))
+        self.blocks = nn.ModuleList(
+            RayTracedBlock(channels=channels, num_heads=num_heads, expansion=expansion)
+            for _ in range(num_blocks)
+        )
+        self.voxel_norm = nn.LayerNorm(channels)
+        self.pixel_norm = nn.LayerNorm(channels)
+        # ImageNet statistics, on which torchvision's weights were trained; a mask channel is left as it is.
+        shift, scale = [0.485, 0.456, 0.406, 0.0], [0.229, 0.224, 0.225, 1.0]
+        self.register_buffer("image_mean", torch.tensor(shift[: resnet.input_channels]), persistent=False)
+        self.register_buffer("image_std", torch.tensor(scale[: resnet.input_channels]), persistent=False)
+
+    def forward(
+        self, images: Tensor, pairs: PairList, resolution: tuple[int, int, int], *, with_pixels: bool = True
+    ) -> tuple[Tensor, Tensor | None]:
+        """Return features of the scene and of its views.
+
+        Args:
+            images: ``(B, N, 3 or 4, H, W)`` uint8, or floating point in [0, 1].
+            pairs: the pixel-voxel pairs of all B scenes, for feature maps of ``H/16 × W/16``.
+            resolution: ``(X, Y, Z)``.
+            with_pixels: False leaves out the last block's 3D→2D stream, which only pixel features need.
+
+        Returns:
+            voxel features ``(B, X, Y, Z, C)``, and pixel features ``(B, N, h, w, C)`` or None.
+
+        Raises:
+            ShapeError: images have other channels than the encoder, or sides not divisible by 16.
+        """
+        check_shape(images, f"B N {self.resnet.input_channels} H W", "images")
+        if images.shape[-2] % STRIDE or images.shape[-1] % STRIDE:
+            raise ShapeError(
+                f"expected images with sides divisible by {STRIDE}, got {tuple(images.shape[-2:])}"
+            )
+        pixels = self._embed(images.flatten(0, 1))
+        splatted, seen = splat_features(pixels.flatten(0, 2), pairs)
+        voxels = torch.where(seen[:, None], splatted, self.unseen.to(splatted.dtype))
+        voxels = voxels.view(images.shape[0], *resolution, self.channels)
+        for index, block in enumerate(self.blocks):
+            update_pixels = with_pixels or index + 1 < len(self.blocks)
+            voxels, pixels = block(voxels, pixels, pairs, update_pixels=update_pixels)
+        if not with_pixels:
+            return self.voxel_norm(voxels), None
+        return self.voxel_norm(voxels), self.pixel_norm(pixels).unflatten(0, images.shape[:2])
+
+    def idle_without_pixels(self) -> tuple[str, ...]:
+        """Return the names of the sub-modules that ``forward(..., with_pixels=False)`` does not reach."""
+        return (f"blocks.{len(self.blocks) - 1}.pixel_stream", "pixel_norm")
+
+    def _embed(self, images: Tensor) -> Tensor:
+        """Map ``(n, c, H, W)`` to pixel features P⁰, ``(n, h, w, C)``."""
+        scaled = images.to(self.image_mean.dtype)
+        if not images.is_floating_point():
+            scaled = scaled / 255
+        normalized = (scaled - self.image_mean[:, None, None]) / self.image_std[:, None, None]
+        return self.projection(self.resnet(normalized).movedim(1, -1))

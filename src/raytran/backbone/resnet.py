@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ResNet-18 at stride 16 with torchvision's parameter names (He et al., CVPR 2016)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import cast
+from urllib.error import URLError
+
+import torch
+from torch import Tensor, nn
+
+from raytran.errors import CheckpointError, ConfigError
+
+IMAGENET_URL = "https://download.pytorch.org/models/resnet18-f37072fd.pth"
+"""torchvision's ``ResNet18_Weights.IMAGENET1K_V1``; the name carries the first digits of its SHA-256."""
+
+
+class BasicBlock(nn.Module):
+    """Two 3×3 convolutions with a skip."""
+
+    def __init__(self, in_channels: int, channels: int, stride: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(in_channels, channels, 3, stride, padding=1, bias=False)
+        self.bn1 = nn.BatchNorm2d(channels)
+        self.conv2 = nn.Conv2d(channels, channels, 3, padding=1, bias=False)
+        self.bn2 = nn.BatchNorm2d(channels)
+        self.downsample: nn.Module | None = None
+        if stride != 1 or in_channels != channels:
+            self.downsample = nn.Sequential(
+                nn.Conv2d(in_channels, channels, 1, stride, bias=False), nn.BatchNorm2d(channels)
+            )
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Map ``(n, C, H, W)`` to ``(n, C', H/stride, W/stride)``."""
+        out = torch.relu_(self.bn1(self.conv1(x)))
+        out = self.bn2(self.conv2(out))
+        return torch.relu_(out + (x if self.downsample is None else self.downsample(x)))
+
+
+class ResNet18(nn.Module):
+    """The trunk of ResNet-18 without its classifier.
+
+    The last stage keeps its resolution, so the output has stride 16: 640×480 gives the paper's 40×30.
+
+    Args:
+        width: channels of the first stage; 64 is ResNet-18, the output has ``8 · width``.
+        input_channels: 3, or 4 with a mask as input (RayTran §4). Weights for three channels are kept and
+            the fourth starts at zero, so that the network begins as the pretrained one.
+        weights: None (random), ``"imagenet"`` (fetched by URL, hash checked), or a file with a state dict
+            under torchvision's names, with or without ``fc``. Needed only at construction.
+
+    Raises:
+        ConfigError: weights are given for another width.
+        CheckpointError: the weights cannot be fetched, read, or do not fit.
+    """
+
+    def __init__(
+        self, *, width: int = 64, input_channels: int = 3, weights: str | Path | None = None
+    ) -> None:
+        super().__init__()
+        self.input_channels = input_channels
+        self.out_channels = 8 * width
+        self.conv1 = nn.Conv2d(input_channels, width, 7, stride=2, padding=3, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        self.maxpool = nn.MaxPool2d(3, stride=2, padding=1)
+        self.layer1 = _stage(width, width, stride=1)
+        self.layer2 = _stage(width, 2 * width, stride=2)
+        self.layer3 = _stage(2 * width, 4 * width, stride=2)
+        self.layer4 = _stage(4 * width, 8 * width, stride=1)
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+        if weights is not None:
+            if width != 64:
+                raise ConfigError(
+                    f"pretrained weights need resnet width 64, got {width}: set weights=null or width=64"
+                )
+            self._load(weights)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """Map normalised images ``(n, 3 or 4, H, W)`` to features ``(n, 8 · width, H/16, W/16)``."""
+        x = self.maxpool(torch.relu_(self.bn1(self.conv1(images))))
+        return self.layer4(self.layer3(self.layer2(self.layer1(x))))
+
+    def _load(self, weights: str | Path) -> None:
+        state = _fetch_imagenet() if weights == "imagenet" else _read_state(Path(weights))
+        state = {key: value for key, value in state.items() if not key.startswith("fc.")}
+        first = state.get("conv1.weight")
+        if first is not None and first.shape[1] == 3 and self.input_channels == 4:
+            state["conv1.weight"] = torch.cat([first, torch.zeros_like(first[:, :1])], dim=1)
+        try:
+            self.load_state_dict(state)
+        except RuntimeError as error:
+            reason = str(error).splitlines()[-1].strip()
+            raise CheckpointError(
+                f"{weights} does not fit ResNet-18 ({reason}): give a state dict with torchvision's names"
+            ) from error
+
+
+def _stage(in_channels: int, channels: int, *, stride: int) -> nn.Sequential:
+    return nn.Sequential(BasicBlock(in_channels, channels, stride), BasicBlock(channels, channels, 1))
+
+
+def _fetch_imagenet() -> dict[str, Tensor]:
+    name = IMAGENET_URL.rsplit("/", 1)[1]
+    folder = Path(torch.hub.get_dir()) / "checkpoints"
+    try:
+        return torch.hub.load_state_dict_from_url(IMAGENET_URL, map_location="cpu", check_hash=True)
+    except (URLError, OSError, RuntimeError) as error:
+        raise CheckpointError(
+            f"could not fetch the ImageNet weights ({error}): download {IMAGENET_URL} and put it at "
+            f"{folder / name}, or set weights to its path, or weights=null for a random start"
+        ) from error
+
+
+def _read_state(path: Path) -> dict[str, Tensor]:
+    if not path.is_file():
+        raise CheckpointError(
+            f"no ResNet-18 weights at {path}: download {IMAGENET_URL} there, "
+            "or set weights=imagenet, or weights=null for a random start"
+        )
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch.load raises whatever its unpickler or zip reader meets
+        raise CheckpointError(f"{path} is not a readable state dict ({error}): download it again") from error
+    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
+        raise CheckpointError(
+            f"{path} holds no state dict: give a file of named tensors with torchvision's names"
+        )
+    return cast("dict[str, Tensor]", state)
