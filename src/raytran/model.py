@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""RayTran: posed images of a room → its objects, with class, pose and shape (Tyszkiewicz et al., ECCV 2022).
+
+This is the page to read first. The backbone lifts the images into a voxel grid (§3.1); heads read the
+result (§3.2): what is occupied, what is foreground in each view, and which objects there are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from raytran.backbone.backbone import STRIDE, Backbone
+from raytran.geometry.camera import Cameras
+from raytran.geometry.grid import VoxelGrid
+from raytran.geometry.rotation import rotation_from_yaw
+from raytran.ops.traverse import trace_pairs
+from raytran.types import PADDING, ObjectSet, RawObjects, RawScene, ScenePrediction, Views
+
+TASKS = ("occupancy", "foreground", "objects")
+"""What ``forward`` can be asked for; shapes are decoded afterwards, for chosen queries only."""
+
+SHAPES_AT_ONCE = 16
+
+
+class RayTran(nn.Module):
+    """The network.
+
+    Args:
+        backbone: images and pixel-voxel pairs → voxel and pixel features.
+        heads: ``occupancy``, ``foreground``, ``objects`` and ``shape``, or those of them that are needed.
+        grid_resolution: ``(X, Y, Z)`` voxels.
+        grid_extent: sizes of the voxel grid, metres.
+        rays_per_cell: n×n rays join a cell of the feature map with the voxels they cross.
+    """
+
+    def __init__(
+        self,
+        *,
+        backbone: Backbone,
+        heads: Mapping[str, nn.Module],
+        grid_resolution: Sequence[int] = (48, 48, 16),
+        grid_extent: Sequence[float] = (9.0, 9.0, 3.5),
+        rays_per_cell: int = 2,
+    ) -> None:
+        super().__init__()
+        self.backbone = backbone
+        self.heads = nn.ModuleDict(heads)
+        self.grid_resolution = (int(grid_resolution[0]), int(grid_resolution[1]), int(grid_resolution[2]))
+        self.grid_extent = (float(grid_extent[0]), float(grid_extent[1]), float(grid_extent[2]))
+        self.rays_per_cell = rays_per_cell
+
+    def forward(
+        self, views: Views, *, tasks: Collection[str] = TASKS, grid_center: Tensor | None = None
+    ) -> RawScene:
+        """Run the backbone once and the heads of ``tasks``.
+
+        Args:
+            views: posed images of B scenes.
+            tasks: some of ``TASKS``.
+            grid_center: ``(B, 3)`` centres of the voxel grids, metres; by default the mean camera position.
+
+        Returns:
+            Raw predictions, None for what was not asked for.
+
+        Raises:
+            ShapeError: image sides are not divisible by 16, or tensors do not have the documented shapes.
+        """
+        cameras = Cameras(views.intrinsics, views.world_from_camera, views.image_size)
+        center = cameras.position.mean(dim=1) if grid_center is None else grid_center
+        grid = VoxelGrid(self.grid_resolution, self.grid_extent, center)
+        feature_size = (views.image_size[0] // STRIDE, views.image_size[1] // STRIDE)
+        pairs = trace_pairs(cameras, grid, feature_size, self.rays_per_cell)
+        with_pixels = "foreground" in tasks
+        voxels, pixels = self.backbone(views.images, pairs, self.grid_resolution, with_pixels=with_pixels)
+        return RawScene(
+            grid_center=center,
+            occupancy=self.heads["occupancy"](voxels) if "occupancy" in tasks else None,
+            foreground=self.heads["foreground"](pixels) if with_pixels else None,
+            objects=self.heads["objects"](voxels, grid) if "objects" in tasks else None,
+        )
+
+    def decode_shapes(self, embedding: Tensor) -> Tensor:
+        """Return shape logits ``(M, S, S, S)`` of query embeddings ``(M, C)``."""
+        return self.heads["shape"](embedding)
+
+    def idle_modules(self, tasks: Collection[str]) -> tuple[str, ...]:
+        """Return the names of the sub-modules that ``forward`` does not reach when asked for ``tasks``.
+
+        Their parameters get no gradient, so a stage of training must freeze them; ``shape`` counts as a task.
+        """
+        heads = tuple(f"heads.{name}" for name in self.heads if name not in tasks)
+        if "foreground" in tasks:
+            return heads
+        return heads + tuple(f"backbone.{name}" for name in self.backbone.idle_without_pixels())
+
+    @torch.no_grad()
+    def predict(
+        self, views: Views, *, scene_id: str = "", score_threshold: float = 0.0, with_shapes: bool = True
+    ) -> ScenePrediction:
+        """Predict one scene (B = 1). Puts the network in eval mode.
+
+        Args:
+            views: posed images, batch dimension 1.
+            scene_id: name to give the result.
+            score_threshold: slots with a lower score are left out.
+            with_shapes: decode the objects' shapes.
+        """
+        self.eval()
+        raw = self(views)
+        return self.decode(raw, [scene_id], score_threshold=score_threshold, with_shapes=with_shapes)[0]
+
+    @torch.no_grad()
+    def decode(
+        self,
+        raw: RawScene,
+        scene_ids: Sequence[str],
+        *,
+        score_threshold: float = 0.0,
+        with_shapes: bool = True,
+    ) -> tuple[ScenePrediction, ...]:
+        """Turn raw predictions of B scenes into objects, masks and occupancy; arguments as in ``predict``."""
+        predictions = []
+        for scene, scene_id in enumerate(scene_ids):
+            objects = ObjectSet.empty().to(raw.grid_center.device)
+            if raw.objects is not None:
+                objects = self._decode_objects(raw.objects[-1], scene, score_threshold, with_shapes)
+            predictions.append(
+                ScenePrediction(
+                    scene_id=scene_id,
+                    objects=objects,
+                    grid_center=raw.grid_center[scene],
+                    occupancy=None if raw.occupancy is None else raw.occupancy[scene].float().sigmoid(),
+                    foreground=None if raw.foreground is None else raw.foreground[scene].float().sigmoid(),
+                )
+            )
+        return tuple(predictions)
+
+    def _decode_objects(
+        self, raw: RawObjects, scene: int, score_threshold: float, with_shapes: bool
+    ) -> ObjectSet:
+        """Return the best class of each slot that is no padding, highest score first."""
+        probability = raw.class_logits[scene].softmax(dim=-1)[:, :PADDING]
+        score, label = probability.max(dim=-1)
+        order = score.argsort(descending=True, stable=True)
+        order = order[score[order] >= score_threshold]
+        sin, cos = raw.yaw_vector[scene, order].unbind(dim=-1)
+        shape = None
+        if with_shapes and "shape" in self.heads:
+            chunks = raw.embedding[scene, order].split(SHAPES_AT_ONCE)
+            shape = torch.cat([self.decode_shapes(chunk).float().sigmoid() for chunk in chunks])
+        return ObjectSet(
+            label=label[order],
+            center=raw.center[scene, order],
+            size=raw.log_size[scene, order].exp(),
+            rotation=rotation_from_yaw(torch.atan2(sin, cos)),
+            symmetry=torch.ones_like(label[order]),
+            score=score[order],
+            shape=shape,
+        )
