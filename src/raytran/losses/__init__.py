@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From raw predictions and targets to scalars to minimise (RayTran §3.2)."""

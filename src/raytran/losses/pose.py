@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far predicted poses are from true ones: what both the matching and the loss add up (RayTran §3.2)."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from raytran.geometry.rotation import symmetric_yaw_error, yaw_from_rotation
+from raytran.types import ObjectSet
+
+CENTER_BETA = 0.1
+"""Error in metres at which the smooth L1 of the centre turns from a square to a line."""
+
+YAW_BETA = 0.1
+"""The same for the yaw, radians."""
+
+
+def pose_errors(center: Tensor, log_size: Tensor, yaw_vector: Tensor, target: ObjectSet) -> dict[str, Tensor]:
+    """Return the pose losses of predictions against true objects, not reduced over objects.
+
+    Smooth L1 of the centre and L1 of the logarithm of the size, each summed over the three axes, and smooth
+    L1 of the yaw, wrapped and taken as the least over the target's symmetries.
+
+    Args:
+        center: ``(..., M or 1, 3)`` metres.
+        log_size: ``(..., M or 1, 3)``.
+        yaw_vector: ``(..., M or 1, 2)`` (sin, cos), of any length.
+        target: M true objects.
+
+    Returns:
+        ``center``, ``size`` and ``yaw``, each ``(..., M)``.
+    """
+    yaw = yaw_from_vector(yaw_vector)
+    yaw_error = symmetric_yaw_error(yaw, yaw_from_rotation(target.rotation), target.symmetry)
+    return {
+        "center": _smooth_l1(center - target.center, CENTER_BETA).sum(dim=-1),
+        "size": (log_size - target.size.log()).abs().sum(dim=-1),
+        "yaw": _smooth_l1(yaw_error, YAW_BETA),
+    }
+
+
+def _smooth_l1(error: Tensor, beta: float) -> Tensor:
+    return F.smooth_l1_loss(error, torch.zeros_like(error), reduction="none", beta=beta)
+
+
+def yaw_from_vector(yaw_vector: Tensor) -> Tensor:
+    """Return the angle of ``(..., 2)`` (sin, cos), ``(...)`` radians, with a gradient of length one.
+
+    The true gradient is as long as one over the vector's length: it explodes near zero and fades far away.
+    This one is that of the vector on the unit circle, whatever its length; it only turns the vector.
+    """
+    length = torch.linalg.vector_norm(yaw_vector.detach(), dim=-1, keepdim=True)
+    unit = torch.where(length > 0, yaw_vector.detach() / length, yaw_vector.new_tensor([0.0, 1.0]))
+    sin, cos = (unit + (yaw_vector - yaw_vector.detach())).unbind(dim=-1)
+    return torch.atan2(sin, cos)
