@@ -10,18 +10,52 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from raytran.data.rooms.models import stools, tables
+from raytran.data.rooms.models import (
+    bathtubs,
+    beds,
+    bins,
+    cabinets,
+    chairs,
+    displays,
+    lamps,
+    printers,
+    shelves,
+    sofas,
+    stools,
+    tables,
+)
 from raytran.data.rooms.models.design import Design
 from raytran.errors import ConfigError
 
 Recipe = Callable[[np.random.Generator], Design]
 
 RECIPES: dict[str, tuple[tuple[float, Recipe], ...]] = {
+    "bathtub": ((0.6, bathtubs.built_in_bathtub), (0.4, bathtubs.oval_bathtub)),
+    "bookshelf": (
+        (0.45, shelves.bookcase),
+        (0.20, shelves.open_rack),
+        (0.15, shelves.cube_shelf),
+        (0.10, shelves.step_shelf),
+        (0.10, shelves.ladder_shelf),
+    ),
+    "cabinet": (
+        (0.28, cabinets.chest_of_drawers),
+        (0.20, cabinets.wardrobe),
+        (0.20, cabinets.sideboard),
+        (0.16, cabinets.night_stand),
+        (0.16, cabinets.tv_cabinet),
+    ),
     "chair": (
-        (0.08, stools.pedestal_stool),
-        (0.08, stools.legged_stool),
+        (0.34, chairs.four_legged_chair),
+        (0.10, chairs.cantilever_chair),
+        (0.28, chairs.office_chair),
+        (0.12, chairs.armchair),
+        (0.06, stools.pedestal_stool),
+        (0.06, stools.legged_stool),
         (0.04, stools.pouffe),
     ),
+    "display": ((0.55, displays.monitor), (0.35, displays.television), (0.10, displays.tube_television)),
+    "sofa": ((0.65, sofas.straight_sofa), (0.35, sofas.corner_sofa)),
     "table": (
         (0.20, tables.round_table),
         (0.15, tables.square_table),
@@ -29,6 +63,23 @@ RECIPES: dict[str, tuple[tuple[float, Recipe], ...]] = {
         (0.15, tables.coffee_table),
         (0.20, tables.drawer_desk),
         (0.10, tables.corner_desk),
+    ),
+    "trashbin": (
+        (0.30, bins.round_bin),
+        (0.12, bins.dome_bin),
+        (0.30, bins.angular_bin),
+        (0.18, bins.pedal_bin),
+        (0.10, bins.wheeled_bin),
+    ),
+    "other": (
+        (0.30, beds.bed),
+        (0.15, beds.pillow),
+        (0.14, lamps.floor_lamp),
+        (0.06, lamps.arc_lamp),
+        (0.13, lamps.table_lamp),
+        (0.06, lamps.desk_lamp),
+        (0.11, printers.printer),
+        (0.05, printers.copier),
     ),
 }
 """Per class, what can be drawn and how often."""

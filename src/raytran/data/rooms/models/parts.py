@@ -98,10 +98,10 @@ def cushion(center: ArrayLike, size: ArrayLike, *, corner: float = 0.05, edge: f
     """Box with corners rounded in plan by ``corner`` and its upper and lower edges rounded by ``edge``."""
     width, height, depth = np.asarray(size, dtype=np.float64)
     edge = min(edge, 0.499 * height, 0.4 * width, 0.4 * depth)
-    angle = np.linspace(0.0, np.pi / 2, 4)
+    angle = np.linspace(0.0, np.pi / 2, 3)
     inset = edge * (1 - np.sin(angle))
     rise = edge * (1 - np.cos(angle))
-    outlines = [rectangle(width - 2 * i, depth - 2 * i, max(corner - i, 0.3 * corner)) for i in inset]
+    outlines = [rectangle(width - 2 * i, depth - 2 * i, max(corner - i, 0.3 * corner), 2) for i in inset]
     heights = [-height / 2 + r for r in rise]
     return moved(stack(outlines + outlines[::-1], heights + [-h for h in heights[::-1]]), center)
 
