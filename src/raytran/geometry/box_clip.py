@@ -33,7 +33,7 @@ def cube_intersection(offset: Tensor, edges: Tensor) -> Tensor:
     Returns:
         ``(n,)`` volumes in units of the cube's frame (the cube has 8).
     """
-    # An end counts as outside a plane only beyond rounding, lest a face that lies in the plane cross it twice.
+    # An end counts as outside a plane only beyond rounding, lest a face lying in the plane cross it twice.
     extent = 1 + offset.abs() + edges.abs().sum(dim=1)
     bound = (1 + 16 * torch.finfo(offset.dtype).eps * extent).detach()
     start, end = _face_edges(offset, edges)

@@ -44,10 +44,10 @@ class OrientedBoxes:
             )
 
     def corners(self) -> Tensor:
-        """Return the corners in the world, ``(..., 8, 3)``, numbered x-major and z fastest along the box's axes.
+        """Return the corners in the world, ``(..., 8, 3)``, numbered x-major, z fastest.
 
-        Corner ``4i + 2j + k`` has the signs ``(2i - 1, 2j - 1, 2k - 1)``: 0 is the lowest along all three axes
-        of the box, 7 the highest.
+        Corner ``4i + 2j + k`` has the signs ``(2i - 1, 2j - 1, 2k - 1)`` along the box's own axes: 0 is the
+        lowest along all three, 7 the highest.
         """
         half = torch.tensor([-0.5, 0.5], dtype=self.size.dtype, device=self.size.device)
         signs = torch.cartesian_prod(half, half, half)

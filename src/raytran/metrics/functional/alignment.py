@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The three errors of the Scan2CAD benchmark (Avetisyan et al., 2019) between predicted and true objects."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from raytran.geometry.rotation import geodesic_angle
+from raytran.types import SYMMETRY_INFINITE, ObjectSet
+
+
+class AlignmentErrors(NamedTuple):
+    """Errors of every prediction against every true object, each ``(P, M)``.
+
+    Attributes:
+        translation: distance of the box centres, metres.
+        rotation: angle of the turn that remains, degrees, the least over the true object's symmetries.
+        scale: ``|mean_k(size_k / true size_k) - 1|``; as in the benchmark, opposite errors of the axes
+            cancel.
+    """
+
+    translation: Tensor
+    rotation: Tensor
+    scale: Tensor
+
+    def within(self, max_translation: float, max_rotation: float, max_scale: float) -> Tensor:
+        """Return where all three errors keep their limits (metres, degrees, ratio), ``(P, M)`` bool."""
+        close = (self.translation <= max_translation) & (self.rotation <= max_rotation)
+        return close & (self.scale <= max_scale)
+
+
+def alignment_errors(predictions: ObjectSet, targets: ObjectSet) -> AlignmentErrors:
+    """Return the three errors of every prediction against every true object, in the inputs' precision."""
+    translation = (predictions.center[:, None] - targets.center).norm(dim=-1)
+    scale = ((predictions.size[:, None] / targets.size).mean(dim=-1) - 1).abs()
+    rotation = symmetric_rotation_error(predictions.rotation, targets.rotation, targets.symmetry)
+    return AlignmentErrors(translation, rotation, scale)
+
+
+def symmetric_rotation_error(predicted: Tensor, target: Tensor, symmetry: Tensor) -> Tensor:
+    """Return the angle from each target to each prediction, least over the target's turns about its up axis.
+
+    The angle is that of the full rotation, so a tilt counts. For infinite symmetry the least over all turns
+    is the angle between the two up axes.
+
+    Args:
+        predicted: ``(P, 3, 3)`` world_from_object.
+        target: ``(M, 3, 3)`` world_from_object.
+        symmetry: ``(M,)`` int64: 1, 2, 4 equal turns, or ``SYMMETRY_INFINITE``.
+
+    Returns:
+        ``(P, M)`` degrees in [0, 180].
+    """
+    quarter = torch.arange(4, device=target.device)
+    turned = target @ _turns_about_up(quarter * (math.pi / 2), target.dtype)[:, None]
+    angle = geodesic_angle(predicted[:, None, None], turned)
+    equal = (quarter[:, None] * symmetry) % 4 == 0
+    finite = torch.where(equal, angle, torch.inf).amin(dim=1)
+    up_distance = (predicted[:, None, :, 1] - target[:, :, 1]).norm(dim=-1)
+    between_up = 2 * torch.asin((up_distance / 2).clamp(max=1.0))
+    return torch.rad2deg(torch.where(symmetry == SYMMETRY_INFINITE, between_up, finite))
+
+
+def _turns_about_up(angle: Tensor, dtype: torch.dtype) -> Tensor:
+    """Return rotations about the object's +Y, ``(n,)`` radians → ``(n, 3, 3)``."""
+    sin, cos = torch.sin(angle).to(dtype), torch.cos(angle).to(dtype)
+    zero, one = torch.zeros_like(sin), torch.ones_like(sin)
+    return torch.stack([cos, zero, sin, zero, one, zero, -sin, zero, cos], dim=-1).unflatten(-1, (3, 3))

@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Precision, recall and F1 of oriented boxes, the metric introduced by ODAM (Li et al., 2021)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypedDict
+
+import torch
+from torch import Tensor
+
+from raytran.errors import ConfigError
+from raytran.geometry.boxes import OrientedBoxes, box_iou
+from raytran.metrics.functional.box_f1 import BestScores, DetectionScores, best_f1, detection_scores
+from raytran.metrics.functional.matching import match_in_order, score_order
+from raytran.metrics.records import Row, SceneRecord, SceneRecordMetric
+from raytran.types import CLASSES, ObjectSet
+
+BOX_F1_PROTOCOLS: tuple[str, ...] = ("strict",)
+
+
+class ThresholdScores(DetectionScores):
+    """Scores of all predictions at one IoU threshold, and of those above the score that maximises F1."""
+
+    best: BestScores
+
+
+class BoxF1Result(TypedDict):
+    """What ``OrientedBoxF1.compute`` returns; the keys of ``per_threshold`` are IoUs, such as ``"0.25"``."""
+
+    per_threshold: dict[str, ThresholdScores]
+    n_scenes: int
+
+
+class OrientedBoxF1(SceneRecordMetric):
+    """Precision, recall and F1 of predicted boxes, pooled over all classes and scenes.
+
+    Protocol ``strict``: exact IoU of the oriented boxes; all nine classes, matched by name; predictions take
+    their turn by score, and each takes the free object of highest IoU if that is *above* the threshold, so
+    that matching is one to one; every scene counts. All predictions given count; ``best`` tells what is
+    reached when those below one score, chosen to maximise F1, are left out.
+
+    Args:
+        protocol: ``"strict"``.
+        iou_thresholds: IoUs that a match must exceed.
+        **kwargs: see ``torchmetrics.Metric``.
+
+    Raises:
+        ConfigError: the protocol is unknown, or there is no threshold.
+    """
+
+    def __init__(
+        self, *, protocol: str = "strict", iou_thresholds: Sequence[float] = (0.25, 0.5), **kwargs: Any
+    ) -> None:
+        super().__init__(**kwargs)
+        if protocol not in BOX_F1_PROTOCOLS:
+            known = ", ".join(BOX_F1_PROTOCOLS)
+            raise ConfigError(f"unknown protocol {protocol!r} of OrientedBoxF1, choose one of: {known}")
+        if not iou_thresholds:
+            raise ConfigError(
+                "OrientedBoxF1 needs at least one IoU threshold, e.g. iou_thresholds=[0.25, 0.5]"
+            )
+        self.protocol = protocol
+        self.iou_thresholds = tuple(iou_thresholds)
+        # Label; of an object the highest IoU with a prediction of its class, of a prediction the score; then
+        # whether it is matched at each threshold.
+        self.truth_columns = self.prediction_columns = 2 + len(self.iou_thresholds)
+
+    def judge(self, predictions: ObjectSet, targets: ObjectSet) -> tuple[Tensor, Tensor]:
+        """Match one scene at each threshold; see the base class."""
+        boxes_a = OrientedBoxes(predictions.center, predictions.size, predictions.rotation)
+        boxes_b = OrientedBoxes(targets.center, targets.size, targets.rotation)
+        iou, _ = box_iou(boxes_a, boxes_b)
+        iou = torch.where(predictions.label[:, None] == targets.label, iou, 0.0)
+        order = score_order(predictions.score)
+        best = torch.cat([iou, iou.new_zeros(1, len(targets))]).amax(dim=0)
+        truths, taken = (
+            [targets.label.double(), best],
+            [predictions.label.double(), predictions.score.nan_to_num(nan=-torch.inf)],
+        )
+        for threshold in self.iou_thresholds:
+            match = match_in_order(order, iou > threshold, preference=iou)
+            taken.append((match >= 0).double())
+            truths.append(torch.zeros(len(targets)).double().index_fill(0, match[match >= 0], 1.0))
+        return torch.stack(truths, dim=-1), torch.stack(taken, dim=-1)
+
+    def compute(self) -> BoxF1Result:
+        """Return precision, recall, F1 and counts at each IoU threshold."""
+        scenes = self.scenes()
+        n_true = sum(len(scene.truths) for scene in scenes)
+        none = torch.zeros(0, self.prediction_columns, dtype=torch.float64)
+        predictions = torch.cat([none, *(scene.predictions for scene in scenes)])
+        per_threshold = {}
+        for column, threshold in enumerate(self.iou_thresholds, start=2):
+            matched = predictions[:, column] == 1
+            scores = detection_scores(int(matched.sum()), len(predictions), n_true)
+            best = best_f1(predictions[:, 1], matched, n_true)
+            per_threshold[f"{threshold:g}"] = ThresholdScores(**scores, best=best)
+        return BoxF1Result(per_threshold=per_threshold, n_scenes=len(scenes))
+
+    def object_rows(self, record: SceneRecord) -> list[Row]:
+        """Return each object's highest IoU with a prediction of its class, and whether it is matched."""
+        rows: list[Row] = []
+        for index, (label, best, *matched) in enumerate(record.truths.tolist()):
+            row: Row = {"scene_id": record.scene_id, "object": index, "category": CLASSES[int(label)]}
+            rows.append(
+                row | {"best_iou": best} | self._by_threshold("matched", [bool(value) for value in matched])
+            )
+        return rows
+
+    def scene_row(self, record: SceneRecord) -> Row:
+        """Return the counts of one scene."""
+        counts: Row = {"n_predicted": len(record.predictions), "n_true": len(record.truths)}
+        matched = record.truths[:, 2:].sum(dim=0).long().tolist()
+        return {"scene_id": record.scene_id, **counts, **self._by_threshold("n_matched", matched)}
+
+    def _by_threshold(self, name: str, values: Sequence[int]) -> Row:
+        return {
+            f"{name}_{threshold:g}": value
+            for threshold, value in zip(self.iou_thresholds, values, strict=True)
+        }

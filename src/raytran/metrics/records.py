@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A metric that keeps one record a scene, gathered exactly over the ranks of a distributed run."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, cast
+
+import torch
+from torch import Tensor
+from torchmetrics import Metric
+from torchmetrics.utilities import dim_zero_cat
+from torchmetrics.utilities.distributed import gather_all_tensors
+
+from raytran.errors import ShapeError
+from raytran.types import ObjectSet
+
+Row = dict[str, str | int | float | bool | None]
+"""One line of a table: column name to value, None where there is none."""
+
+
+@dataclass(frozen=True)
+class SceneRecord:
+    """The verdict on one scene.
+
+    Attributes:
+        scene_id: name of the scene.
+        truths: ``(M, columns)`` float64, one row for each true object.
+        predictions: ``(P, columns)`` float64, one row for each prediction.
+    """
+
+    scene_id: str
+    truths: Tensor
+    predictions: Tensor
+
+    def encode(self) -> Tensor:
+        """Return the record as one float64 vector: three lengths, the letters of the name, the tables."""
+        name = [float(ord(letter)) for letter in self.scene_id]
+        lengths = [float(len(name)), float(len(self.truths)), float(len(self.predictions))]
+        head = self.truths.new_tensor(lengths + name, dtype=torch.float64)
+        return torch.cat([head, self.truths.double().flatten(), self.predictions.double().flatten()])
+
+
+def decode_records(stream: Tensor, truth_columns: int, prediction_columns: int) -> Iterator[SceneRecord]:
+    """Take apart a vector of encoded records laid end to end."""
+    position = 0
+    while position < len(stream):
+        n_letters, n_truths, n_predictions = (int(n) for n in stream[position : position + 3])
+        parts = [n_letters, n_truths * truth_columns, n_predictions * prediction_columns]
+        name, truths, predictions = stream[position + 3 : position + 3 + sum(parts)].split(parts)
+        yield SceneRecord(
+            "".join(chr(int(letter)) for letter in name),
+            truths.reshape(n_truths, truth_columns),
+            predictions.reshape(n_predictions, prediction_columns),
+        )
+        position += 3 + sum(parts)
+
+
+def _gather_float64(value: Tensor, group: Any = None) -> list[Tensor]:
+    """Gather vectors of any length from all ranks; a rank without scenes sends an empty float32 one."""
+    return gather_all_tensors(value.double(), group)
+
+
+class SceneRecordMetric(Metric):
+    """Base of the metrics over objects: each scene is judged when it is given, and kept as a record.
+
+    A scene is known by its id and counts once: a distributed sampler that repeats scenes to make the ranks
+    equal changes no result. Every scene given counts, with or without predictions.
+    """
+
+    is_differentiable = False
+    higher_is_better = True
+    full_state_update = False
+
+    truth_columns: int
+    prediction_columns: int
+    records: list[Tensor] | Tensor
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(dist_sync_fn=_gather_float64, **kwargs)
+        self.add_state("records", default=[], dist_reduce_fx="cat")
+
+    @abstractmethod
+    def judge(self, predictions: ObjectSet, targets: ObjectSet) -> tuple[Tensor, Tensor]:
+        """Return ``truths`` and ``predictions`` of a scene's record; inputs are float64, on the CPU."""
+
+    @abstractmethod
+    def object_rows(self, record: SceneRecord) -> list[Row]:
+        """Return one row for each true object of a scene."""
+
+    @abstractmethod
+    def scene_row(self, record: SceneRecord) -> Row:
+        """Return the row of a scene."""
+
+    def update(
+        self, predictions: Sequence[ObjectSet], targets: Sequence[ObjectSet], scene_ids: Sequence[str]
+    ) -> None:
+        """Judge scenes.
+
+        Args:
+            predictions: the predicted objects of each scene; all of them count.
+            targets: the annotated objects of each scene.
+            scene_ids: the name of each scene.
+
+        Raises:
+            ShapeError: the three do not have the same length.
+        """
+        if not len(predictions) == len(targets) == len(scene_ids):
+            raise ShapeError(
+                "expected predictions, targets and names of the same scenes, got "
+                f"{len(predictions)}, {len(targets)} and {len(scene_ids)}"
+            )
+        records = cast("list[Tensor]", self.records)  # a tensor only while synchronised
+        device = "cpu" if self.device.type == "mps" else self.device  # MPS has no float64
+        for predicted, target, scene_id in zip(predictions, targets, scene_ids, strict=True):
+            tables = self.judge(_in_float64(predicted), _in_float64(target))
+            records.append(SceneRecord(scene_id, *tables).encode().to(device))
+
+    def scenes(self) -> list[SceneRecord]:
+        """Return the records in this process, or of all ranks while they are synchronised, one a scene."""
+        if isinstance(self.records, list) and not self.records:
+            return []
+        stream = dim_zero_cat(self.records).cpu()
+        found: dict[str, SceneRecord] = {}
+        for record in decode_records(stream, self.truth_columns, self.prediction_columns):
+            found.setdefault(record.scene_id, record)
+        return list(found.values())
+
+    def rows(self, per: Literal["object", "scene"] = "object") -> list[Row]:
+        """Return a table of all ranks' scenes; in a distributed run every rank must call it.
+
+        Args:
+            per: ``"object"`` for a row for each true object, ``"scene"`` for a row for each scene.
+        """
+        with self.sync_context(dist_sync_fn=self.dist_sync_fn):
+            scenes = self.scenes()
+        if per == "scene":
+            return [self.scene_row(record) for record in scenes]
+        return [row for record in scenes for row in self.object_rows(record)]
+
+
+def _in_float64(objects: ObjectSet) -> ObjectSet:
+    """Return the boxes of a set in float64 on the CPU, without shapes."""
+    boxes = replace(objects, shape=None).to("cpu")
+    return replace(
+        boxes,
+        center=boxes.center.detach().double(),
+        size=boxes.size.detach().double(),
+        rotation=boxes.rotation.detach().double(),
+        score=boxes.score.detach().double(),
+    )
