@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The list of pixel-voxel pairs that a ray joins, in both orders (RayTran §3.1, "Ray-traced attention layers")."""
+"""The list of pixel-voxel pairs that a ray joins, in both orders (RayTran §3.1)."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ray-traced sparse attention: multi-head attention between the pixels and voxels that a ray joins (RayTran §3.1).
+"""Ray-traced sparse attention between the pixels and voxels that a ray joins (RayTran §3.1).
 
 No score of a pair that no ray joins is ever computed. The softmax weights, ``H · P`` floats, are all that is
 kept for the backward pass. It needs no atomic addition: the sums over targets run along the rows of the pair
@@ -78,7 +78,7 @@ class _RayAttention(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         query, key, value, weights, *orders = ctx.saved_tensors
         by_target, by_source = PairOrder(*orders[:3]), PairOrder(*orders[3:])
         scale = query.shape[2] ** -0.5
@@ -97,7 +97,7 @@ class _RayAttention(torch.autograd.Function):
 
 
 def _place_in(order: PairOrder, wanted: PairOrder) -> Tensor:
-    """Return ``(P,)`` such that ``values[place]`` brings the values of ``order`` into the order ``wanted``."""
+    """Return ``(P,)`` such that ``values[place]`` brings values from ``order`` into ``wanted``."""
     place = torch.empty_like(order.permutation)
     place[order.permutation] = torch.arange(place.shape[0], device=place.device)
     return place[wanted.permutation]

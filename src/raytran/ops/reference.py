@@ -50,9 +50,9 @@ def slab_trace_pairs(
 ) -> PairList:
     """Compute ``raytran.ops.traverse.trace_pairs`` of one scene by testing each ray against each voxel.
 
-    A ray is inside a slab between two planes over an interval of depth, inside a voxel over the
-    intersection of three of them, and the voxel counts if that is longer than ``min_depth`` metres in front of the
-    camera. A ray parallel to a slab is in it for ever or never; slabs are half-open.
+    A ray is inside a slab between two planes over an interval of depth, inside a voxel over the intersection
+    of three of them, and the voxel counts if that is longer than ``min_depth`` metres in front of the camera.
+    A ray parallel to a slab is in it for ever or never; slabs are half-open.
     """
     precise = Cameras(cameras.intrinsics.double(), cameras.world_from_camera.double(), cameras.image_size)
     directions = precise.cell_rays(feature_size, rays_per_cell)[1].flatten(0, 2)
@@ -78,8 +78,9 @@ def _depth_inside(origin: Tensor, ray: Tensor, lower: Tensor, upper: Tensor) -> 
     near, far = torch.zeros(len(lower)).double(), torch.full((len(lower),), torch.inf).double()
     for axis in range(3):
         low, high = lower[:, axis], upper[:, axis]
-        if ray[axis] == 0:
-            outside = (origin[axis] < low) | (origin[axis] >= high)
+        if ray[axis].abs() < 1e-12:
+            # Less than rounding below a face counts as on it, and so as in the slab above.
+            outside = (origin[axis] < low - 1e-10) | (origin[axis] >= high - 1e-10)
             near = near.masked_fill(outside, torch.inf)
             far = far.masked_fill(outside, 0.0)
             continue

@@ -49,7 +49,7 @@ class _Splat(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         by_voxel, by_pixel = PairOrder(*ctx.saved_tensors[:3]), PairOrder(*ctx.saved_tensors[3:])
         with torch.autocast(grad.device.type, enabled=False):
             ones = grad.new_ones(by_pixel.col_index.shape)

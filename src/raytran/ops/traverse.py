@@ -5,9 +5,10 @@ A voxel is entered through one of its faces. So the voxels along a ray are those
 with the grid's planes (as in Amanatides & Woo, "A fast voxel traversal algorithm", 1987, whose steps are here
 taken all at once), and the voxel in which it begins.
 
-Rule for ties. A voxel counts if the ray runs through its inside for more than ``NUDGE``; a ray that only
-touches an edge or a corner does not pass through the voxels beside it. A ray that runs inside a face, parallel
-to an axis, belongs to the voxel on the side of the larger coordinate: cells are half-open, [i, i+1).
+Rule for ties. A voxel counts if the ray runs through its inside for more than ``NUDGE``; voxels that it only
+touches, along an edge or at a corner, do not count. A ray that runs inside a face, parallel to an axis,
+belongs to the voxel on the side of the larger coordinate: cells are half-open, [i, i+1), and so is the whole
+grid. A camera within ``NUDGE`` of a plane of the grid stands on it, so that rounding decides none of this.
 """
 
 from __future__ import annotations
@@ -21,10 +22,13 @@ from raytran.geometry.grid import VoxelGrid
 from raytran.ops.pairs import PairList
 
 NUDGE = 1e-9
-"""How far behind a crossing (metres of depth) a ray is looked at to tell which voxel it entered."""
+"""Lengths below this count as zero: metres of depth along a ray, and sizes of a voxel for positions."""
+
+_PARALLEL = 1e-12
+"""Slopes below this, in voxels per metre of depth, count as zero."""
 
 _RAYS_AT_ONCE = {"cpu": 1 << 12}
-_RAYS_AT_ONCE_ELSEWHERE = 1 << 19
+_RAYS_AT_ONCE_ELSEWHERE = 1 << 17
 """Rays traced together: few enough on a CPU that the work stays in its cache."""
 
 
@@ -86,6 +90,8 @@ def _rays_in_grid(
     grid = VoxelGrid(grid.resolution, grid.extent, grid.center.double().to(directions.device))
     origins = grid.voxel_from_world(precise.position)[..., None, :]
     directions = (directions / grid.voxel_size).flatten(-4, -2)
+    origins = torch.where((origins - origins.round()).abs() < NUDGE, origins.round(), origins)
+    directions = directions.masked_fill_(directions.abs() < _PARALLEL, 0.0)
     return (origins[None], directions[None]) if len(lead) == 1 else (origins, directions)
 
 
@@ -100,38 +106,52 @@ def _trace(
         resolution: ``(X, Y, Z)``.
         rays_per_pixel: how many rays that is.
     """
-    strides = (resolution[1] * resolution[2], resolution[2], 1)
-    num_voxels = resolution[0] * strides[0]
-    like = {"dtype": origin.dtype, "device": origin.device}
-    pixel = torch.arange(origin.shape[1] // rays_per_pixel, **like).repeat_interleave(rays_per_pixel)
+    num_voxels = resolution[0] * resolution[1] * resolution[2]
+    pixel = torch.arange(origin.shape[1] // rays_per_pixel, dtype=origin.dtype, device=origin.device)
+    base = pixel.repeat_interleave(rays_per_pixel) * num_voxels
     first, last = _clip(origin, direction, resolution)
-    found = []
-    for axis in (None, 0, 1, 2):
-        key = pixel * num_voxels
-        if axis is None:  # the voxel in which the ray begins
-            depth = torch.full_like(first, NUDGE)[None]
-        else:  # the voxels entered through planes across this axis: cell i at its lower or its upper face
-            cell = torch.arange(resolution[axis], **like)[:, None]
-            slope = 1 / direction[axis]
-            depth = torch.addcmul(
-                ((direction[axis] < 0).to(origin) - origin[axis]) * slope + NUDGE, cell, slope
-            )
-            key = key + cell * strides[axis]
-        for other in {0, 1, 2} - {axis}:
-            index = torch.addcmul(origin[other], direction[other], depth).floor_()
-            # A crossing that counts is inside the grid; rounding must not say otherwise.
-            key = key + index.clamp_(0, resolution[other] - 1).mul_(strides[other])
-        found.append(key[(depth > first) & (depth < last)])
+    found = [(base + _start(origin, direction, resolution))[(first == 0) & (last > NUDGE)]]
+    for axis in range(3):
+        depth, voxel = _entered(axis, origin, direction, resolution)
+        found.append(voxel.add_(base)[(depth > first) & (depth < last)])
     wide = num_voxels * origin.shape[1] >= 2**31
     keys = torch.cat(found).to(torch.int64 if wide else torch.int32)
     return torch.unique_consecutive(keys.sort().values)
 
 
 def _clip(origin: Tensor, direction: Tensor, resolution: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
-    """Return the depths ``(R,)`` at which each ray enters and leaves the grid, entry ≥ 0; leave < entry: misses."""
+    """Return the depths at which rays enter (≥ 0) and leave the grid, ``(R,)`` each; leave ≤ enter: miss."""
     size = torch.tensor(resolution, dtype=origin.dtype, device=origin.device)[:, None]
     lower, upper = -origin / direction, (size - origin) / direction
     parallel, inside = direction == 0, (origin >= 0) & (origin < size)
     near = torch.where(parallel, torch.where(inside, -torch.inf, torch.inf), torch.minimum(lower, upper))
     far = torch.where(parallel, torch.inf, torch.maximum(lower, upper))
     return near.amax(0).clamp_(min=0), far.amin(0)
+
+
+def _start(origin: Tensor, direction: Tensor, resolution: tuple[int, int, int]) -> Tensor:
+    """Return the voxel in which each ray begins, ``(R,)``; without meaning for cameras outside the grid."""
+    index = torch.where(direction < 0, origin.ceil() - 1, origin.floor())
+    return (index[0] * resolution[1] + index[1]) * resolution[2] + index[2]
+
+
+def _entered(
+    axis: int, origin: Tensor, direction: Tensor, resolution: tuple[int, int, int]
+) -> tuple[Tensor, Tensor]:
+    """Return the voxels that each ray enters across one axis and a depth just behind the crossing.
+
+    Both are ``(n, R)`` for the ``n`` cells along the axis: into cell i a ray comes through the plane i, or
+    i + 1 if it runs backwards. Outside the grid they have no meaning.
+    """
+    strides = (resolution[1] * resolution[2], resolution[2], 1)
+    cell = torch.arange(resolution[axis], dtype=origin.dtype, device=origin.device)[:, None]
+    slope = 1 / direction[axis]
+    backwards = (direction[axis] < 0).to(origin.dtype)
+    depth = torch.addcmul((backwards - origin[axis]) * slope + NUDGE, cell, slope)
+    voxel = (cell * strides[axis]).expand_as(depth)
+    for other in range(3):
+        if other != axis:
+            index = torch.addcmul(origin[other], direction[other], depth).floor_()
+            # A crossing that counts is inside the grid; rounding must not say otherwise.
+            voxel = voxel + index.clamp_(0, resolution[other] - 1).mul_(strides[other])
+    return depth, voxel
