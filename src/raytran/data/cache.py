@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Arrays kept on disk under a key that names all their inputs, so that an entry never goes stale."""
+"""Boolean arrays kept on disk under a key that names all their inputs, so that an entry never goes stale."""
 
 from __future__ import annotations
 
 import hashlib
+import math
 import os
-import zipfile
 import zlib
-from collections.abc import Callable
-from functools import lru_cache
+from functools import cache
 from pathlib import Path
 from uuid import uuid4
 
@@ -17,14 +16,12 @@ from numpy.typing import NDArray
 
 from raytran.errors import DataError
 
-_UNREADABLE = (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile, zlib.error)
 
-
-class ArrayCache:
+class MaskCache:
     """A folder of boolean arrays, safe for any number of readers and writers at once.
 
-    Entries are bits packed into compressed ``.npz`` files, whose checksum is tested on reading. A damaged
-    entry is made again. Writers replace whole files, so a reader meets the old one or the new one.
+    Entries are packed bits, compressed by zlib, whose checksum is tested on reading. A damaged entry counts
+    as missing. Writers replace whole files, so a reader meets the old one or the new one.
 
     Args:
         folder: where the entries lie; made on the first write.
@@ -33,30 +30,46 @@ class ArrayCache:
     def __init__(self, *, folder: Path) -> None:
         self._folder = Path(folder)
 
-    def get(self, kind: str, key: str, make: Callable[[], NDArray[np.bool_]]) -> NDArray[np.bool_]:
-        """Return the array stored under ``key``, or make and store it.
+    def read(self, kind: str, key: str, shape: tuple[int, ...]) -> NDArray[np.bool_] | None:
+        """Return the array stored under ``key``, or None if there is none or it is damaged.
 
         Args:
             kind: sub-folder, e.g. ``"foreground"``.
-            key: hexadecimal digest of everything the array depends on (``digest``).
-            make: computes the array.
+            key: digest of everything the array depends on (``digest``).
+            shape: of the array.
+        """
+        try:
+            bits = np.frombuffer(zlib.decompress(self._path(kind, key).read_bytes()), dtype=np.uint8)
+        except (OSError, zlib.error):
+            return None
+        count = math.prod(shape)
+        if len(bits) != -(-count // 8):
+            return None
+        return np.unpackbits(bits, count=count).reshape(shape).view(np.bool_)
+
+    def write(self, kind: str, key: str, array: NDArray[np.bool_]) -> None:
+        """Store an array under ``key``.
 
         Raises:
             DataError: the folder cannot be written.
         """
-        path = self._folder / kind / key[:2] / f"{key}.npz"
+        path = self._path(kind, key)
+        temporary = path.with_name(f"{key}-{uuid4().hex}.tmp")
         try:
-            return _read(path)
-        except _UNREADABLE:
-            array = make()
-        try:
-            _write(path, array)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                temporary.write_bytes(zlib.compress(np.packbits(array).tobytes()))
+                os.replace(temporary, path)
+            finally:
+                temporary.unlink(missing_ok=True)
         except OSError as error:
             raise DataError(
                 f"cannot write to the cache of training targets at {self._folder} ({error.strerror}): "
                 "make room there or choose another cache_dir"
             ) from error
-        return array
+
+    def _path(self, kind: str, key: str) -> Path:
+        return self._folder / kind / key[:2] / f"{key}.bits.z"
 
 
 def digest(*parts: object) -> str:
@@ -87,24 +100,7 @@ def file_digest(path: Path) -> str:
         ) from error
 
 
-@lru_cache(maxsize=None)
+@cache
 def _content_digest(path: Path, _size: int, _time: int) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _read(path: Path) -> NDArray[np.bool_]:
-    with np.load(path) as entry:
-        shape = tuple(entry["shape"].tolist())
-        return np.unpackbits(entry["bits"], count=int(np.prod(shape))).reshape(shape).astype(bool)
-
-
-def _write(path: Path, array: NDArray[np.bool_]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f"{path.stem}-{uuid4().hex}.tmp")
-    try:
-        with temporary.open("wb") as file:
-            np.savez_compressed(file, bits=np.packbits(array), shape=np.array(array.shape))
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ def read_image(path: Path, image_size: tuple[int, int], *, stored: tuple[int, in
         stored: ``(H, W)`` that the file must have, or None for any.
 
     Returns:
-        ``(3, H, W)`` uint8 RGB.
+        ``(3, H, W)`` uint8 RGB, a view of ``(H, W, 3)``.
 
     Raises:
         DataError: the file is truncated, damaged, or of another size than ``stored``.
@@ -44,12 +45,15 @@ def read_image(path: Path, image_size: tuple[int, int], *, stored: tuple[int, in
                 raise DataError(
                     f"{path} is {image.size[0]}x{image.size[1]}, not {stored[1]}x{stored[0]} as the others"
                 )
-            # A JPEG decodes at ½, ¼ or ⅛ of its size for less time, as long as that is no less than asked for.
+            # A JPEG decodes at ½, ¼ or ⅛ of its size for less time, but not below what is asked for.
             image.draft("RGB", (width, height))
-            pixels = image.convert("RGB").resize((width, height), Image.Resampling.BILINEAR)
+            pixels = image if image.mode == "RGB" else image.convert("RGB")
+            if pixels.size != (width, height):
+                pixels = pixels.resize((width, height), Image.Resampling.BILINEAR)
+            array = np.array(pixels)
     except _UNREADABLE as error:
         raise DataError(f"cannot read the image {path} ({error}): copy or export it again") from error
-    return torch.from_numpy(np.array(pixels)).permute(2, 0, 1).contiguous()
+    return torch.from_numpy(array).permute(2, 0, 1)
 
 
 def read_images(
@@ -90,17 +94,17 @@ def read_images(
 
     good = [position for position in chosen if can_read(position)]
     for position in (position for position in chosen if position in failed):
-        neighbours = sorted(range(len(paths)), key=lambda other, here=position: abs(other - here))
-        fresh = (other for other in neighbours if other not in good and can_read(other))
-        again = (other for other in neighbours if other in good)
-        good.extend([other for other in [next(fresh, next(again, None))] if other is not None])
+        near_to_far = np.argsort(np.abs(np.arange(len(paths)) - position), kind="stable").tolist()
+        fresh = (other for other in near_to_far if other not in good and can_read(other))
+        again = (other for other in near_to_far if other in good)
+        good.extend(other for other in [next(fresh, next(again, -1))] if other >= 0)
     if failed:
         first = next(iter(failed.values()))
-        _LOG.warning("skipped %d unreadable images of %s: %s", len(failed), paths[0].parent.parent, first)
+        _warn_once(f"skipped {len(failed)} unreadable images of {paths[0].parent.parent}: {first}")
     if len(set(good)) < min(min_views, len(chosen)):
         raise DataError(
-            f"only {len(set(good))} of {len(paths)} usable frames in {paths[0].parent} can be read and {min_views} "
-            "are needed: copy or export them again"
+            f"only {len(set(good))} of {len(paths)} usable frames in {paths[0].parent} can be read and "
+            f"{min_views} are needed: copy or export them again"
         )
     used = sorted(good)
     return torch.stack([read[position] for position in used]), used
@@ -119,3 +123,8 @@ def stored_size(paths: Sequence[Path]) -> tuple[int, int]:
         except _UNREADABLE:
             continue
     raise DataError(f"no image in {paths[0].parent} can be read: copy or export them again")
+
+
+@cache
+def _warn_once(message: str) -> None:
+    _LOG.warning(message)

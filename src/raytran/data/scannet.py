@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scans in ScanNet's exported layout: ``color/<n>.jpg``, ``pose/<n>.txt``, ``intrinsic/intrinsic_color.txt``."""
+"""Scans in ScanNet's exported layout: ``color/<n>.jpg``, ``pose/<n>.txt``, ``intrinsic/``, ``<scan>.txt``."""
 
 from __future__ import annotations
 
@@ -216,8 +216,9 @@ def _read_intrinsics(path: Path, image_size: tuple[int, int], header: dict[str, 
     for_stated_size = stated != (width, height) and _distance_from_centre(matrix, *stated) < off
     if off > _OFF_CENTRE or for_stated_size:
         raise DataError(
-            f"{path} has its principal point at ({matrix[0, 2]:.1f}, {matrix[1, 2]:.1f}), which is for another "
-            f"image size than the stored {width}x{height}: scale its first row by W'/W and its second by H'/H"
+            f"{path} has its principal point at ({matrix[0, 2]:.1f}, {matrix[1, 2]:.1f}), so it is for "
+            f"another image size than the stored {width}x{height}: "
+            "scale its first row by W'/W and its second by H'/H"
         )
     return torch.from_numpy(matrix[:3, :3].copy())
 

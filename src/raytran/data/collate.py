@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Several scenes to one batch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import chain
+
+import torch
+from torch import Tensor
+
+from raytran.errors import ShapeError
+from raytran.types import SceneBatch, Views
+
+
+def collate_scenes(samples: Sequence[SceneBatch]) -> SceneBatch:
+    """Join batches along B; the ``collate_fn`` of a ``DataLoader`` over a ``SceneDataset``.
+
+    Args:
+        samples: at least one, with the same number and size of images and the same targets.
+
+    Raises:
+        ShapeError: the images differ in number or size.
+    """
+    shapes = {tuple(sample.views.images.shape[1:]) for sample in samples}
+    if len(shapes) > 1:
+        raise ShapeError(f"expected scenes with images of one number and size, got {sorted(shapes)}")
+    objects = [sample.objects for sample in samples]
+    return SceneBatch(
+        scene_id=tuple(chain.from_iterable(sample.scene_id for sample in samples)),
+        views=Views(
+            images=torch.cat([sample.views.images for sample in samples]),
+            intrinsics=torch.cat([sample.views.intrinsics for sample in samples]),
+            world_from_camera=torch.cat([sample.views.world_from_camera for sample in samples]),
+        ),
+        frame_id=tuple(chain.from_iterable(sample.frame_id for sample in samples)),
+        grid_center=torch.cat([sample.grid_center for sample in samples]),
+        objects=None if None in objects else tuple(chain.from_iterable(o for o in objects if o is not None)),
+        occupancy=_join([sample.occupancy for sample in samples]),
+        foreground=_join([sample.foreground for sample in samples]),
+    )
+
+
+def _join(parts: Sequence[Tensor | None]) -> Tensor | None:
+    present = [part for part in parts if part is not None]
+    return torch.cat(present) if len(present) == len(parts) else None

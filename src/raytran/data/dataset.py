@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scenes on disk as a ``torch`` data set: the one path from files to ``SceneBatch``."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from raytran.data.cache import MaskCache
+from raytran.data.images import MIN_VIEWS
+from raytran.data.scan2cad import SceneAnnotation, read_annotations, scene_objects
+from raytran.data.scannet import Scan, read_scan, scan_views
+from raytran.data.targets import foreground_masks, scene_occupancy, shape_grids
+from raytran.data.views import choose_even, choose_random
+from raytran.errors import ConfigError, DataError
+from raytran.geometry.camera import Cameras
+from raytran.geometry.grid import VoxelGrid
+from raytran.types import ObjectSet, SceneBatch
+
+TARGETS: tuple[str, ...] = ("objects", "shapes", "occupancy", "foreground")
+"""Targets a data set can give; "shapes" gives the objects too."""
+
+
+class SceneDataset(Dataset[SceneBatch]):
+    """Scans with their annotation; item i is a ``SceneBatch`` with B = 1.
+
+    Nothing but the annotation is read before an item is asked for, and targets are kept on disk, so a data
+    set is small to send to the workers of a ``DataLoader``. Random frames depend on the seed, the epoch and
+    the index alone.
+
+    Args:
+        scans_root: folder of the scans, ``…/scannet/scans``.
+        scene_ids: scans to take; if None all in ``scans_root`` that have objects in the annotation, if given.
+        annotations: Scan2CAD's ``full_annotations.json``; may be None if there are no targets.
+        shapenet_root: folder of ShapeNet's categories; needed for all targets but "objects".
+        cache_dir: where targets are kept.
+        image_size: ``(H, W)`` to which images are resized, whatever their aspect.
+        num_views: N.
+        view_choice: ``"random"`` or ``"even"``.
+        grid_resolution: ``(X, Y, Z)`` of the occupancy target.
+        grid_extent: sizes of its grid, metres; the grid is centred on the mean of the cameras.
+        targets: some of ``TARGETS``.
+        input_mask: whether the amodal mask is given as a fourth channel of the images.
+        min_views: fewest different frames of a scene.
+        seed: of the random frames.
+
+    Raises:
+        ConfigError: unknown targets, or a target whose files are not given.
+        DataError: a file or scan is missing, or no scene has objects.
+    """
+
+    def __init__(
+        self,
+        *,
+        scans_root: Path,
+        cache_dir: Path,
+        scene_ids: Sequence[str] | None = None,
+        annotations: Path | None = None,
+        shapenet_root: Path | None = None,
+        image_size: tuple[int, int] = (480, 640),
+        num_views: int = 20,
+        view_choice: Literal["random", "even"] = "random",
+        grid_resolution: tuple[int, int, int] = (48, 48, 16),
+        grid_extent: tuple[float, float, float] = (9.0, 9.0, 3.5),
+        targets: Collection[str] = TARGETS,
+        input_mask: bool = False,
+        min_views: int = MIN_VIEWS,
+        seed: int = 0,
+    ) -> None:
+        _check(targets, view_choice, annotations, shapenet_root, input_mask)
+        self._scans_root = Path(scans_root)
+        self._annotations = read_annotations(annotations) if annotations is not None else {}
+        self.scene_ids = _choose_scenes(self._scans_root, scene_ids, annotations, self._annotations)
+        self._shapenet_root = None if shapenet_root is None else Path(shapenet_root)
+        self._cache = MaskCache(folder=Path(cache_dir))
+        self._image_size = (int(image_size[0]), int(image_size[1]))
+        self._num_views, self._min_views = num_views, min_views
+        self._view_choice = view_choice
+        self._grid_resolution, self._grid_extent = grid_resolution, grid_extent
+        self._targets = frozenset(targets)
+        self._input_mask = input_mask
+        self._seed = seed
+        # In shared memory, so that workers which outlive an epoch see the next one.
+        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
+        self._scans: dict[str, Scan] = {}
+
+    def __len__(self) -> int:
+        return len(self.scene_ids)
+
+    def set_epoch(self, epoch: int) -> None:
+        """Choose the random frames of another epoch; call it before the loader's iterator is made."""
+        self._epoch.fill_(epoch)
+
+    def __getitem__(self, index: int) -> SceneBatch:
+        """Return scene ``index`` with B = 1.
+
+        Raises:
+            DataError: the scan, its images or the CAD models cannot be read.
+        """
+        scene_id = self.scene_ids[index]
+        scan = self._scan(scene_id)
+        views, used = scan_views(
+            scan, self._choose(len(scan), index), image_size=self._image_size, min_views=self._min_views
+        )
+        cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], self._image_size)
+        grid_center = cameras.position.mean(dim=0)
+        objects = self._objects(scene_id)
+        foreground = self._foreground(objects, cameras)
+        if self._input_mask and foreground is not None:
+            views = replace(
+                views, images=torch.cat([views.images, foreground[:, :, None].byte() * 255], dim=2)
+            )
+        return SceneBatch(
+            scene_id=(scene_id,),
+            views=views,
+            frame_id=(tuple(scan.frame_id[i] for i in used),),
+            grid_center=grid_center[None],
+            objects=(self._without_unasked(objects),) if self._targets & {"objects", "shapes"} else None,
+            occupancy=self._occupancy(objects, grid_center),
+            foreground=foreground if "foreground" in self._targets else None,
+        )
+
+    def _scan(self, scene_id: str) -> Scan:
+        if scene_id not in self._scans:
+            self._scans[scene_id] = read_scan(self._scans_root / scene_id)
+        return self._scans[scene_id]
+
+    def _choose(self, n: int, index: int) -> list[int]:
+        if self._view_choice == "even":
+            return choose_even(n, self._num_views).tolist()
+        state = np.random.SeedSequence([self._seed, int(self._epoch), index]).generate_state(1, np.uint64)
+        generator = torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
+        return choose_random(n, self._num_views, generator).tolist()
+
+    def _objects(self, scene_id: str) -> ObjectSet:
+        if scene_id not in self._annotations:
+            return ObjectSet.empty()
+        objects = scene_objects(self._annotations[scene_id])
+        if self._shapenet_root is None or not self._targets & {"shapes", "occupancy"}:
+            return objects
+        shapes = shape_grids(objects.model_id, shapenet_root=self._shapenet_root, cache=self._cache)
+        return replace(objects, shape=shapes)
+
+    def _without_unasked(self, objects: ObjectSet) -> ObjectSet:
+        return objects if "shapes" in self._targets else replace(objects, shape=None)
+
+    def _occupancy(self, objects: ObjectSet, grid_center: Tensor) -> Tensor | None:
+        if "occupancy" not in self._targets:
+            return None
+        grid = VoxelGrid(resolution=self._grid_resolution, extent=self._grid_extent, center=grid_center)
+        return scene_occupancy(objects, grid)[None]
+
+    def _foreground(self, objects: ObjectSet, cameras: Cameras) -> Tensor | None:
+        if self._shapenet_root is None or not (self._input_mask or "foreground" in self._targets):
+            return None
+        return foreground_masks(objects, cameras, shapenet_root=self._shapenet_root, cache=self._cache)[None]
+
+
+def scan2cad_dataset(root: Path, split: str, *, cache_dir: Path, **options: Any) -> SceneDataset:
+    """Open one split of a data set laid out as ``root/{scannet,scan2cad,shapenet}``.
+
+    The scans are those of ``scannet/scannetv2_<split>.txt`` that have objects in
+    ``scan2cad/full_annotations.json``; without any split file, all that do and are in ``scannet/scans``.
+
+    Args:
+        root: of the three folders.
+        split: ``"train"`` or ``"val"``.
+        cache_dir: where targets are kept.
+        options: further arguments of ``SceneDataset``.
+
+    Raises:
+        DataError: the layout is incomplete, or no scan of the split has objects.
+    """
+    root = Path(root)
+    if not (root / "scannet" / "scans").is_dir():
+        raise DataError(
+            f"there is no folder {root / 'scannet' / 'scans'}: prepare the data set or mend its path"
+        )
+    listed = _read_split(root / "scannet", split)
+    annotations = root / "scan2cad" / "full_annotations.json"
+    scene_ids = None
+    if listed is not None:
+        annotated = read_annotations(annotations)
+        scene_ids = [
+            scene_id for scene_id in listed if scene_id in annotated and annotated[scene_id].model_id
+        ]
+        if not scene_ids:
+            raise DataError(
+                f"no scene with objects in {annotations} is in the {split} split: "
+                "check that annotation and split belong together"
+            )
+    return SceneDataset(
+        scans_root=root / "scannet" / "scans",
+        scene_ids=scene_ids,
+        annotations=annotations,
+        shapenet_root=root / "shapenet",
+        cache_dir=cache_dir,
+        **options,
+    )
+
+
+def _read_split(scannet: Path, split: str) -> list[str] | None:
+    """Return the scans of a split, or None if there are no split files at all."""
+    path = scannet / f"scannetv2_{split}.txt"
+    if path.is_file():
+        return path.read_text(encoding="utf-8").split()
+    if any(scannet.glob("scannetv2_*.txt")):
+        raise DataError(f"there is no {path}: choose a split that has a file, or write its scans there")
+    return None
+
+
+def _check(
+    targets: Collection[str],
+    view_choice: str,
+    annotations: Path | None,
+    shapenet_root: Path | None,
+    mask: bool,
+) -> None:
+    unknown = set(targets) - set(TARGETS)
+    if unknown:
+        raise ConfigError(f"unknown targets {sorted(unknown)}: choose from {', '.join(TARGETS)}")
+    if view_choice not in ("random", "even"):
+        raise ConfigError(f"unknown view_choice {view_choice!r}: choose random or even")
+    if (targets or mask) and annotations is None:
+        raise ConfigError("targets and input masks need annotations: give the path of full_annotations.json")
+    if (set(targets) - {"objects"} or mask) and shapenet_root is None:
+        raise ConfigError("shapes, occupancy and masks need CAD models: give shapenet_root")
+
+
+def _choose_scenes(
+    scans_root: Path,
+    scene_ids: Sequence[str] | None,
+    source: Path | None,
+    annotations: dict[str, SceneAnnotation],
+) -> tuple[str, ...]:
+    if not scans_root.is_dir():
+        raise DataError(f"there is no folder {scans_root}: prepare the data set or mend its path")
+    if scene_ids is None:
+        present = sorted(path.name for path in scans_root.iterdir() if path.is_dir())
+        scene_ids = (
+            present
+            if source is None
+            else [s for s in present if s in annotations and annotations[s].model_id]
+        )
+        if not scene_ids:
+            wanted = f"with objects in {source}" if source is not None else "at all"
+            raise DataError(f"no scene {wanted} lies in {scans_root}: check that the paths belong together")
+    missing = [scene_id for scene_id in scene_ids if not (scans_root / scene_id).is_dir()]
+    if missing:
+        raise DataError(
+            f"{len(missing)} of {len(scene_ids)} scans are not in {scans_root}, the first is {missing[0]}: "
+            "add them or take them from the list"
+        )
+    return tuple(scene_ids)
