@@ -48,7 +48,7 @@ CLASS_COLORS: tuple[tuple[int, int, int], ...] = (
     (227, 119, 194),
     (127, 127, 127),
 )
-"""Red, green, blue in [0, 255] of each class, in the order of ``CLASSES``: one colour for pictures and meshes."""
+"""Red, green, blue in [0, 255] of each class, in the order of ``CLASSES``, in pictures and meshes alike."""
 
 PADDING: int = len(CLASSES)
 """Label of the padding class: the query slot holds no object."""

@@ -60,7 +60,8 @@ def read_scene_json(path: Path) -> ScenePrediction:
     """Read what ``write_scene_json`` wrote.
 
     Returns:
-        The objects with symmetry 1 and no shapes. The file does not hold the voxel grid: ``grid_center`` is NaN.
+        The objects, with symmetry 1 and no shapes. The file does not hold the voxel grid, so ``grid_center``
+        is NaN.
 
     Raises:
         DataError: the file is missing, damaged, of another format, or names an unknown category.

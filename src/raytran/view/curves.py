@@ -36,7 +36,7 @@ def read_curves(path: Path) -> Curves:
     return dict(curves)
 
 
-def draw_curves(path: Path, stages: Mapping[str, Curves], *, prefix: str = "train/loss/") -> Path:
+def draw_curves(path: Path, stages: Mapping[str, Curves], *, prefix: str = "train/") -> Path:
     """Draw the terms of the loss, one plot per stage, on a logarithmic scale.
 
     Args:

@@ -1,0 +1,166 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Predict one scene from a folder of posed frames, and write everything a user looks at."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import trimesh
+from omegaconf import DictConfig
+
+from raytran.data.scannet import load_views
+from raytran.errors import ConfigError
+from raytran.export import write_prediction
+from raytran.geometry.camera import Cameras
+from raytran.model import RayTran
+from raytran.postprocess import object_meshes, select_objects
+from raytran.run.checkpoint import model_from
+from raytran.run.output import check_replaceable, replaced_folder
+from raytran.training.checkpoint_file import read_checkpoint
+from raytran.types import ObjectSet, ScenePrediction, Views
+from raytran.view.overlay import draw_overlays
+from raytran.view.topdown import draw_topdown
+
+_LOG = logging.getLogger(__name__)
+
+_IMPORTERS = {"auto": load_views, "scannet": load_views}
+"""Name of a folder's layout → reader of its views."""
+
+MARKER = "scene.json"
+
+
+@dataclass(frozen=True)
+class PredictedScene:
+    """A prediction whose best objects were chosen, and their meshes in the world (None: empty shape)."""
+
+    prediction: ScenePrediction
+    meshes: Sequence[trimesh.Trimesh | None]
+
+
+def predict(cfg: DictConfig) -> Path:
+    """Run ``python -m raytran.predict``; see ``conf/predict.yaml``.
+
+    Returns:
+        The folder of results.
+
+    Raises:
+        ConfigError: a setting is unknown or ``output`` must not be replaced.
+        CheckpointError: the checkpoint is missing or damaged.
+        DataError: the scene's folder is missing or damaged.
+    """
+    scene, output = Path(cfg.scene).resolve(), Path(cfg.output)
+    read_views = _importer(cfg.format)
+    check_replaceable(output.resolve(), marker=MARKER)
+    checkpoint = read_checkpoint(Path(cfg.checkpoint))
+    model = model_from(checkpoint, Path(cfg.checkpoint)).to(_device(cfg.device))
+    height, width = checkpoint["views"]["image_size"]
+    num_views = cfg.num_views or checkpoint["views"]["predict_views"]
+    views, frame_ids = _without_repeats(*read_views(scene, image_size=(height, width), num_views=num_views))
+    found = predict_scene(
+        model,
+        views,
+        scene_id=scene.name,
+        score_threshold=cfg.score_threshold,
+        duplicate_iou=cfg.duplicate_iou,
+    )
+    write_scene(output, found, views, frame_ids, grid_extent=model.grid_extent, num_overlays=cfg.num_overlays)
+    _report(output, found)
+    return output
+
+
+def predict_scene(
+    model: RayTran, views: Views, *, scene_id: str, score_threshold: float, duplicate_iou: float | None
+) -> PredictedScene:
+    """Run the network on the views of one scene and make meshes of the objects it found.
+
+    Args:
+        model: the network, on any device.
+        views: B = 1.
+        scene_id: name to give the result.
+        score_threshold: objects with a lower score are left out.
+        duplicate_iou: of two objects of a class whose box IoU is higher, the weaker is left out; None keeps both.
+
+    Returns:
+        The result, on the CPU.
+    """
+    device = next(model.parameters()).device
+    raw = model.predict(views.to(device), scene_id=scene_id, score_threshold=score_threshold).to("cpu")
+    prediction = select_objects(raw, score_threshold=score_threshold, duplicate_iou=duplicate_iou)
+    return PredictedScene(prediction, object_meshes(prediction))
+
+
+def write_scene(
+    output: Path,
+    found: PredictedScene,
+    views: Views,
+    frame_ids: Sequence[str],
+    *,
+    grid_extent: tuple[float, float, float],
+    num_overlays: int = 4,
+    truth: ObjectSet | None = None,
+) -> None:
+    """Write ``scene.json``, ``scene.glb``, ``meshes/``, ``topdown.png`` and ``overlays/``, all or nothing.
+
+    Args:
+        output: folder; replaced if it is an earlier result.
+        found: what was predicted.
+        views: B = 1, what it was predicted from.
+        frame_ids: name of each frame.
+        grid_extent: sizes of the voxel grid, metres.
+        num_overlays: frames to draw over.
+        truth: annotated objects to draw in the plan, or None.
+
+    Raises:
+        ConfigError: ``output`` holds something that is no earlier result.
+    """
+    prediction = found.prediction
+    cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], views.image_size)
+    with replaced_folder(output, marker=MARKER) as folder:
+        draw_topdown(
+            folder / "topdown.png", prediction, truth=truth, cameras=cameras, grid_extent=grid_extent
+        )
+        draw_overlays(folder / "overlays", views, frame_ids, prediction, found.meshes, count=num_overlays)
+        write_prediction(folder, prediction, found.meshes)
+
+
+def _importer(name: str) -> Callable[..., tuple[Views, Sequence[str]]]:
+    if name not in _IMPORTERS:
+        raise ConfigError(f"unknown format={name}: choose one of {', '.join(_IMPORTERS)}")
+    return _IMPORTERS[name]
+
+
+def _without_repeats(views: Views, frame_ids: Sequence[str]) -> tuple[Views, tuple[str, ...]]:
+    """Leave out second appearances of frames, which come when more are asked for than there are."""
+    first = {name: n for n, name in reversed(list(enumerate(frame_ids)))}
+    kept = sorted(first.values())
+    views = Views(views.images[:, kept], views.intrinsics[:, kept], views.world_from_camera[:, kept])
+    return views, tuple(frame_ids[n] for n in kept)
+
+
+def _device(name: str) -> torch.device:
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise ConfigError(
+            f"cannot use device={name} ({str(error).splitlines()[0]}): choose auto or cpu"
+        ) from error
+    return device
+
+
+def _report(output: Path, found: PredictedScene) -> None:
+    count, meshes = len(found.prediction.objects), sum(mesh is not None for mesh in found.meshes)
+    if count:
+        _LOG.info("%s: %d objects, %d of them with a mesh", found.prediction.scene_id, count, meshes)
+    else:
+        _LOG.info(
+            "%s: no object has a score above the threshold; lower score_threshold to see weaker ones",
+            found.prediction.scene_id,
+        )
+    _LOG.info("wrote %s: scene.json, scene.glb, meshes/, topdown.png, overlays/", output.resolve())

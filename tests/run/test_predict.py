@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a folder of posed frames to files, with a network that always finds the same things."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from omegaconf import DictConfig, OmegaConf
+from PIL import Image
+from torch import nn
+
+from raytran.errors import CheckpointError, ConfigError, DataError
+from raytran.run import predict as module
+from raytran.types import ObjectSet, ScenePrediction, Views
+
+IMAGE_SIZE = (48, 64)
+UPRIGHT = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+
+
+class Oracle(nn.Module):
+    """Finds two chairs in the same place, and a weak table; the first chair's shape is a full box."""
+
+    grid_extent = (8.0, 8.0, 4.0)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.zeros(1))
+        self.seen: Views | None = None
+
+    def predict(self, views: Views, *, scene_id: str, score_threshold: float) -> ScenePrediction:
+        self.seen = views
+        center = torch.tensor([[0.5, 3.0, 0.5], [0.55, 3.0, 0.5], [-1.0, 3.0, 0.4]])
+        objects = ObjectSet(
+            label=torch.tensor([3, 3, 6]),
+            center=center,
+            size=torch.tensor([[0.5, 1.0, 0.6]] * 3),
+            rotation=UPRIGHT.expand(3, 3, 3),
+            symmetry=torch.ones(3, dtype=torch.int64),
+            score=torch.tensor([0.9, 0.8, 0.3]),
+            shape=torch.stack([torch.ones(9, 9, 9), torch.ones(9, 9, 9), torch.zeros(9, 9, 9)]),
+        )
+        chosen = objects.select(objects.score >= score_threshold)
+        return ScenePrediction(scene_id, chosen, torch.zeros(3), occupancy=torch.rand(4, 4, 2))
+
+
+@pytest.fixture
+def scene(tmp_path):
+    """Five frames of 60 × 80 along a straight walk, looking along +y; the third has no valid pose."""
+    folder = tmp_path / "living_room"
+    for name in ("color", "pose", "intrinsic"):
+        (folder / name).mkdir(parents=True)
+    for n in range(5):
+        Image.new("RGB", (80, 60), (40 * n, 90, 90)).save(folder / "color" / f"{5 * n}.jpg")
+        pose = np.eye(4)
+        pose[:3, :3] = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
+        pose[:3, 3] = [0.1 * n, 0, 1.4]
+        np.savetxt(folder / "pose" / f"{5 * n}.txt", np.full((4, 4), -np.inf) if n == 2 else pose)
+    intrinsic = np.eye(4)
+    intrinsic[:2, :3] = [[70, 0, 40], [0, 70, 30]]
+    np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", intrinsic)
+    return folder
+
+
+@pytest.fixture
+def oracle(monkeypatch) -> Oracle:
+    model = Oracle()
+    card = {"views": {"image_size": list(IMAGE_SIZE), "predict_views": 96}}
+    monkeypatch.setattr(module, "read_checkpoint", lambda path: card)
+    monkeypatch.setattr(module, "model_from", lambda checkpoint, path: model)
+    return model
+
+
+def config(folder, output, **changes) -> DictConfig:
+    values = {
+        "checkpoint": "a.ckpt",
+        "scene": str(folder),
+        "output": str(output),
+        "format": "auto",
+        "num_views": None,
+        "score_threshold": 0.5,
+        "duplicate_iou": 0.5,
+        "num_overlays": 2,
+        "device": "cpu",
+    }
+    return OmegaConf.create(values | changes)
+
+
+def test_all_files_are_written(scene, oracle, tmp_path):
+    output = module.predict(config(scene, tmp_path / "out" / "room"))
+    content = json.loads((output / "scene.json").read_text())
+    assert content["scene_id"] == "living_room"
+    assert [(o["category"], o["mesh"]) for o in content["objects"]] == [("chair", "meshes/00.ply")]
+    mesh = trimesh.load(output / "meshes" / "00.ply")
+    # 0.5 m wide, 0.6 m deep, 1 m high round (0.5, 3, 0.5); marching cubes end half a cell in or out.
+    assert np.allclose(mesh.bounds, [[0.25, 2.7, 0.0], [0.75, 3.3, 1.0]], atol=0.07)
+    assert {path.name for path in output.iterdir()} == {
+        "scene.json",
+        "scene.glb",
+        "meshes",
+        "topdown.png",
+        "overlays",
+    }
+    assert len(list((output / "overlays").iterdir())) == 2
+    assert [path.name for path in output.parent.iterdir()] == ["room"]
+
+
+def test_views_follow_the_checkpoint_and_come_once(scene, oracle, tmp_path):
+    module.predict(config(scene, tmp_path / "out"))
+    # 96 views are asked for, four have a pose; frames shrink to the network's size, intrinsics with them.
+    assert oracle.seen.images.shape == (1, 4, 3, *IMAGE_SIZE)
+    assert oracle.seen.intrinsics[0, 0, 0].tolist() == pytest.approx([70 * 0.8, 0, 32])
+    assert oracle.seen.world_from_camera[0, :, 0, 3].tolist() == pytest.approx([0.0, 0.1, 0.3, 0.4])
+    module.predict(config(scene, tmp_path / "out", num_views=2))
+    assert oracle.seen.images.shape[1] == 2
+
+
+def test_thresholds(scene, oracle, tmp_path):
+    output = module.predict(config(scene, tmp_path / "out", score_threshold=0.2, duplicate_iou=None))
+    objects = json.loads((output / "scene.json").read_text())["objects"]
+    assert [(o["category"], o["mesh"]) for o in objects] == [
+        ("chair", "meshes/00.ply"),
+        ("chair", "meshes/01.ply"),
+        ("table", None),
+    ]
+
+
+def test_nothing_found_is_a_result_and_is_said(scene, oracle, tmp_path, caplog):
+    caplog.set_level("INFO")
+    output = module.predict(config(scene, tmp_path / "out", score_threshold=0.95))
+    assert json.loads((output / "scene.json").read_text())["objects"] == []
+    assert (output / "topdown.png").is_file()
+    assert (output / "scene.glb").is_file()
+    assert len(list((output / "overlays").iterdir())) == 2
+    assert "no object has a score above the threshold" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"format": "colmap"}, ConfigError, "unknown format=colmap: choose one of auto, scannet"),
+        ({"device": "abacus"}, ConfigError, "cannot use device=abacus"),
+        ({"scene": "nowhere"}, DataError, "nowhere"),
+    ],
+)
+def test_mistakes_are_one_sentence_and_leave_nothing(scene, oracle, tmp_path, changes, error, message):
+    with pytest.raises(error, match=message):
+        module.predict(config(scene, tmp_path / "out", **changes))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_checkpoint(scene, tmp_path):
+    with pytest.raises(CheckpointError, match=r"a\.ckpt"):
+        module.predict(config(scene, tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
