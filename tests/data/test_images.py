@@ -1,0 +1,121 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reading, resizing, and what happens with damaged images."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from raytran.data.images import read_image, read_images, stored_size
+from raytran.errors import DataError
+
+
+@pytest.fixture
+def paths(tmp_path):
+    """Six plain grey images, 10·n bright."""
+    folder = tmp_path / "scan" / "color"
+    folder.mkdir(parents=True)
+    for n in range(6):
+        Image.new("RGB", (16, 8), (10 * n,) * 3).save(folder / f"{n}.jpg")
+    return [folder / f"{n}.jpg" for n in range(6)]
+
+
+def cut(path) -> None:
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+def test_colours_and_axes(tmp_path) -> None:
+    pixels = np.zeros((4, 6, 3), dtype=np.uint8)
+    pixels[1, 5] = (200, 100, 50)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    image = read_image(tmp_path / "a.png", (4, 6))
+    assert image.dtype == torch.uint8
+    assert image.shape == (3, 4, 6)
+    assert image[:, 1, 5].tolist() == [200, 100, 50]
+    assert image.sum() == 350
+
+
+def test_resize_averages_and_need_not_keep_the_aspect(tmp_path) -> None:
+    pixels = np.zeros((8, 8, 3), dtype=np.uint8)
+    pixels[:, 4:] = 200
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    image = read_image(tmp_path / "a.png", (4, 16))
+    assert image.shape == (3, 4, 16)
+    assert (image[:, :, :6] == 0).all()
+    assert (image[:, :, 10:] == 200).all()
+
+
+@pytest.mark.parametrize("size", [(968, 1296), (720, 1280)])
+def test_large_jpeg_keeps_its_geometry(tmp_path, size) -> None:
+    """Decoding at half size must not shift the picture: a bright right half stays the right half."""
+    pixels = np.zeros((*size, 3), dtype=np.uint8)
+    pixels[:, size[1] // 2 :] = 255
+    Image.fromarray(pixels).save(tmp_path / "a.jpg", quality=95)
+    row = read_image(tmp_path / "a.jpg", (480, 640))[0, 240].float()
+    edge = 640 - row.sum() / 255
+    assert abs(edge - 320) < 0.75
+
+
+def test_grey_and_alpha_become_rgb(tmp_path) -> None:
+    Image.new("L", (4, 4), 70).save(tmp_path / "grey.jpg")
+    Image.new("RGBA", (4, 4), (1, 2, 3, 4)).save(tmp_path / "alpha.png")
+    assert read_image(tmp_path / "grey.jpg", (4, 4))[:, 0, 0].tolist() == [70, 70, 70]
+    assert read_image(tmp_path / "alpha.png", (4, 4))[:, 0, 0].tolist() == [1, 2, 3]
+
+
+def test_truncated_image_and_wrong_size_name_the_file(paths) -> None:
+    cut(paths[2])
+    with pytest.raises(DataError, match=r"2\.jpg"):
+        read_image(paths[2], (8, 16))
+    with pytest.raises(DataError, match=r"1\.jpg is 16x8, not 48x32"):
+        read_image(paths[1], (8, 16), stored=(32, 48))
+
+
+def test_unreadable_image_is_replaced_by_its_neighbour_and_counted(paths, caplog) -> None:
+    cut(paths[2])
+    with caplog.at_level(logging.WARNING):
+        images, used = read_images(paths, [0, 2, 4], image_size=(8, 16), stored=(8, 16))
+    assert used == [0, 1, 4]
+    assert images[:, 0, 4, 8].tolist() == [0, 10, 40]
+    assert images.is_contiguous()
+    assert "skipped 1 unreadable" in caplog.text
+    assert "2.jpg" in caplog.text
+
+
+def test_replacement_may_be_unreadable_too(paths) -> None:
+    for n in (1, 2, 3):
+        cut(paths[n])
+    _, used = read_images(paths, [0, 2, 4], image_size=(8, 16), stored=(8, 16))
+    assert used == [0, 4, 5]
+
+
+def test_readable_image_comes_twice_when_none_is_left(paths) -> None:
+    cut(paths[5])
+    images, used = read_images(paths, [0, 1, 2, 3, 4, 5], image_size=(8, 16), stored=(8, 16))
+    assert used == [0, 1, 2, 3, 4, 4]
+    assert images[:, 0, 4, 8].tolist() == [0, 10, 20, 30, 40, 40]
+
+
+def test_too_few_readable_images(paths) -> None:
+    for n in range(1, 6):
+        cut(paths[n])
+    with pytest.raises(DataError, match=r"only 1 of 6 usable frames .* 2 are needed"):
+        read_images(paths, [0, 2, 4], image_size=(8, 16), stored=(8, 16))
+
+
+def test_none_readable(paths) -> None:
+    for path in paths:
+        path.write_bytes(b"no image")
+    with pytest.raises(DataError, match="only 0 of 6"):
+        read_images(paths, [0, 2], image_size=(8, 16), stored=(8, 16))
+    with pytest.raises(DataError, match="no image in"):
+        stored_size(paths)
+
+
+def test_stored_size_is_height_and_width(paths) -> None:
+    paths[0].write_bytes(b"no image")
+    assert stored_size(paths) == (8, 16)

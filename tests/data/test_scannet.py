@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scans: order of frames, dropped frames, intrinsics, and the two real cases."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from raytran.data.scannet import load_views, read_scan
+from raytran.errors import DataError
+
+
+def test_frames_are_in_the_order_of_their_numbers(write_scan) -> None:
+    scan = read_scan(write_scan(frames=(100, 9, 20, 0)))
+    assert scan.scene_id == "scene0000_00"
+    assert scan.frame_id == ("0", "9", "20", "100")
+    assert [path.name for path in scan.image_path] == ["0.jpg", "9.jpg", "20.jpg", "100.jpg"]
+    torch.testing.assert_close(
+        scan.world_from_camera[:, 0, 3], torch.tensor([0, 0.09, 0.2, 1.0], dtype=torch.float64)
+    )
+    assert scan.image_size == (32, 48)
+    assert len(scan) == 4
+    assert torch.equal(scan.axis_alignment, torch.eye(4, dtype=torch.float64))
+
+
+def test_frames_without_image_or_valid_pose_are_dropped_with_the_reason(write_scan) -> None:
+    folder = write_scan(frames=(0, 1, 2, 3, 4, 5, 6))
+    np.savetxt(folder / "pose" / "1.txt", np.full((4, 4), -np.inf))
+    (folder / "pose" / "2.txt").write_text("nan " * 16)
+    (folder / "pose" / "3.txt").write_text("1 0 0")
+    np.savetxt(folder / "pose" / "4.txt", np.zeros((4, 4)))
+    (folder / "color" / "5.jpg").unlink()
+    (folder / "pose" / "6.txt").unlink()
+    scan = read_scan(folder)
+    assert scan.frame_id == ("0",)
+    rigid = "pose is not a rigid motion"
+    assert scan.dropped == {"1": rigid, "2": rigid, "3": rigid, "4": rigid, "5": "no image", "6": "no pose"}
+
+
+def test_header_gives_the_axis_alignment(write_scan) -> None:
+    folder = write_scan()
+    matrix = np.eye(4)
+    matrix[0, 3] = -1.5
+    text = " ".join(f"{value:f}" for value in matrix.ravel())
+    (folder / "scene0000_00.txt").write_text(f"axisAlignment = {text} \ncolorWidth = 48\ncolorHeight = 32\n")
+    assert read_scan(folder).axis_alignment[0, 3] == -1.5
+
+
+def test_views_are_resized_with_their_intrinsics(write_scan) -> None:
+    views, frame_id = load_views(write_scan(), image_size=(16, 96), num_views=2)
+    assert frame_id == ("10", "100")
+    assert views.images.shape == (1, 2, 3, 16, 96)
+    assert views.images.dtype == torch.uint8
+    assert views.images[0, :, 0, 8, 48].tolist() == [10, 100]
+    # 48×32 → 96×16: u doubles, v halves.
+    torch.testing.assert_close(
+        views.intrinsics[0, 0], torch.tensor([[80.0, 0, 48], [0, 20, 8], [0, 0, 1]]), rtol=0, atol=0
+    )
+    torch.testing.assert_close(views.world_from_camera[0, :, :3, 3], torch.tensor([[0.1, 0, 1], [1, 0, 1]]))
+    assert views.world_from_camera.dtype == torch.float32
+
+
+def test_missing_parts_are_named(write_scan, tmp_path) -> None:
+    with pytest.raises(DataError, match="there is no scan folder .*nowhere"):
+        read_scan(tmp_path / "nowhere")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(DataError, match="has no folder color"):
+        read_scan(tmp_path / "empty")
+    folder = write_scan()
+    (folder / "intrinsic" / "intrinsic_color.txt").unlink()
+    with pytest.raises(DataError, match=r"intrinsic_color\.txt is missing"):
+        read_scan(folder)
+
+
+def test_all_poses_invalid(write_scan) -> None:
+    folder = write_scan()
+    for path in (folder / "pose").iterdir():
+        np.savetxt(path, np.full((4, 4), -np.inf))
+    with pytest.raises(
+        DataError, match="none of the 4 frames in .*scene0000_00 has an image and a valid pose"
+    ):
+        read_scan(folder)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_intrinsics_for_another_image_size(write_scan, factor) -> None:
+    folder = write_scan()
+    intrinsics = np.diag([40.0 * factor, 40 * factor, 1, 1])
+    intrinsics[:2, 2] = (24 * factor, 16 * factor)
+    np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", intrinsics)
+    with pytest.raises(DataError, match="another image size than the stored 48x32"):
+        read_scan(folder)
+
+
+def test_intrinsics_for_a_slightly_other_size_that_the_header_states(write_scan) -> None:
+    """54×36 against 48×32 differs too little to see by the principal point alone."""
+    folder = write_scan()
+    intrinsics = np.array([[45.0, 0, 26.8, 0], [0, 45, 18.1, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", intrinsics)
+    read_scan(folder)
+    (folder / "scene0000_00.txt").write_text("colorWidth = 54\ncolorHeight = 36\n")
+    with pytest.raises(DataError, match="another image size"):
+        read_scan(folder)
+
+
+def test_intrinsics_that_are_no_matrix(write_scan) -> None:
+    folder = write_scan()
+    (folder / "intrinsic" / "intrinsic_color.txt").write_text("577 577 320 240")
+    with pytest.raises(DataError, match="does not hold a 4x4 camera matrix"):
+        read_scan(folder)
+
+
+def test_damaged_header_is_named(write_scan) -> None:
+    folder = write_scan()
+    (folder / "scene0000_00.txt").write_text("axisAlignment = 1 0 0\n")
+    with pytest.raises(DataError, match=r"axisAlignment in .*scene0000_00\.txt"):
+        read_scan(folder)
+
+
+def test_truncated_images_are_skipped_until_too_few_remain(write_scan) -> None:
+    folder = write_scan(frames=(0, 10, 20))
+    path = folder / "color" / "10.jpg"
+    path.write_bytes(path.read_bytes()[:-50])
+    _, frame_id = load_views(folder, image_size=(32, 48), num_views=3)
+    assert frame_id == ("0", "0", "20")
+    path = folder / "color" / "20.jpg"
+    path.write_bytes(path.read_bytes()[:-50])
+    with pytest.raises(DataError, match="only 1 of 3"):
+        load_views(folder, image_size=(32, 48), num_views=3)
+
+
+def test_real_scan_with_lost_frames(shared_dir) -> None:
+    folder = shared_dir / "realdata" / "scene0470_00" / "scannet" / "scans" / "scene0470_00"
+    scan = read_scan(folder)
+    assert sorted(scan.dropped) == ["255", "605"]
+    assert scan.frame_id == tuple(str(n) for n in range(0, 600, 10))
+    assert scan.image_size == (480, 640)
+    assert scan.intrinsics[0].tolist() == [577.870605, 0.0, 319.5]
+    # The scan is turned by 4.3° against its walls; poses stay as they are.
+    angle = torch.atan2(scan.axis_alignment[1, 0], scan.axis_alignment[0, 0]).rad2deg()
+    assert angle.item() == pytest.approx(-4.3, abs=0.05)
+    expected = np.loadtxt(folder / "pose" / "10.txt")
+    np.testing.assert_array_equal(scan.world_from_camera[1].numpy(), expected)
+
+
+def test_real_walk_is_resized_to_another_aspect(shared_dir) -> None:
+    folder = shared_dir / "realdata" / "hololens_lounge" / "scans" / "hololens_000"
+    scan = read_scan(folder)
+    assert scan.image_size == (360, 540)
+    assert len(scan) == 96
+    assert scan.dropped == {}
+    views, frame_id = load_views(folder, image_size=(480, 640), num_views=4)
+    assert views.images.shape == (1, 4, 3, 480, 640)
+    assert [int(n) for n in frame_id] == sorted(int(n) for n in frame_id)
+    matrix = views.intrinsics[0, 0]
+    torch.testing.assert_close(matrix[0], torch.tensor([495.567757, 0, 269.502897]) * 640 / 540)
+    torch.testing.assert_close(matrix[1], torch.tensor([0, 495.481963, 169.194112]) * 480 / 360)
+    with Image.open(folder / "color" / f"{frame_id[0]}.jpg") as image:
+        mean = np.asarray(image, dtype=float).mean(axis=(0, 1))
+    np.testing.assert_allclose(views.images[0, 0].float().mean(dim=(1, 2)), mean, atol=1.0)
