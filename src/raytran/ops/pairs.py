@@ -78,12 +78,12 @@ class PairList(Parcel):
 
     @cached_property
     def _by_voxels(self) -> PairOrder:
-        # Stable, so that pixels rise within a voxel and sums do not depend on the sort's whim.
-        place = torch.sort(self.voxel_index, stable=True).indices
-        return PairOrder(_offsets(self.voxel_index, self.num_voxels), self.pixel_index[place].int(), place)
+        # Stable, so that pixels rise within a voxel and the order of every sum is fixed.
+        voxel, place = torch.sort(self.voxel_index, stable=True)
+        return PairOrder(_offsets(voxel, self.num_voxels), self.pixel_index[place].int(), place)
 
 
 def _offsets(row_index: Tensor, num_rows: int) -> Tensor:
     """Return where each row begins in a list sorted by row, ``(num_rows + 1,)`` int32."""
-    counts = torch.bincount(row_index, minlength=num_rows)
-    return torch.nn.functional.pad(counts.cumsum(0), (1, 0)).int()
+    rows = torch.arange(num_rows + 1, device=row_index.device)
+    return torch.searchsorted(row_index, rows, out_int32=True)

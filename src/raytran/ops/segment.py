@@ -13,8 +13,10 @@ from torch import Tensor
 
 from raytran.ops.pairs import PairOrder
 
-# torch says so once per process of every CSR tensor; the operations used here are tested against dense twins.
-warnings.filterwarnings("ignore", message="Sparse CSR tensor support is in beta state")
+with warnings.catch_warnings():
+    # torch warns once per process that CSR tensors are in beta; what is used of them has tests of its own.
+    warnings.simplefilter("ignore")
+    torch.sparse_csr_tensor([0, 0], [], [], (1, 1))
 
 
 def row_of_pair(order: PairOrder) -> Tensor:
