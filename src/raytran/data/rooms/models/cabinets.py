@@ -92,7 +92,7 @@ class Carcass:
             self.add_front(left, right, below, above, "drawer")
 
     def add_doors(self, left: float, right: float, low: float, high: float, count: int) -> None:
-        """Fill a rectangle of the face with ``count`` doors side by side, opening from the middle in pairs."""
+        """Fill a rectangle of the face with ``count`` doors side by side that open in pairs."""
         edges = np.linspace(left, right, count + 1)
         for i in range(count):
             self.add_front(edges[i], edges[i + 1], low, high, "right" if i % 2 == 0 else "left")

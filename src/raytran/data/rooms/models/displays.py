@@ -55,9 +55,9 @@ def tube_television(rng: np.random.Generator) -> Design:
     sections = [(1.0, -0.5), (1.0, -0.1), (0.9, 0.05), (0.55, 0.42), (0.5, 0.5)]
     outlines = [parts.rectangle(share * width, share * height, 0.03) for share, _ in sections]
     housing = parts.stack(outlines, [place * depth for _, place in sections])
-    design.add(parts.moved(parts.tilted(housing, -90), (0, height / 2 + 0.03, 0)), color)
+    design.add(parts.moved(parts.tilted(housing, 90), (0, height / 2 + 0.03, 0)), color)
     screen = parts.cushion((0, 0, 0), (0.86 * width, 0.03, 0.78 * height), corner=0.04, edge=0.012)
-    design.add(parts.moved(parts.tilted(screen, -90), (0, height / 2 + 0.045, -depth / 2)), palette.SCREEN)
+    design.add(parts.moved(parts.tilted(screen, 90), (0, height / 2 + 0.045, -depth / 2)), palette.SCREEN)
     design.add(
         parts.box((0, 0.02, -0.1 * depth), (0.7 * width, 0.04, 0.6 * depth)), palette.shade(color, 0.8)
     )

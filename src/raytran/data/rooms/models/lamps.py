@@ -100,8 +100,7 @@ def desk_lamp(rng: np.random.Generator) -> Design:
 
 
 def _round_shade(lower: float, upper: float, bottom: float, top: float) -> parts.Part:
-    """Round shade open below, closed by a thin disc on top which holds it to the pole."""
+    """Round shade, hollow and open below, whose top is a thin disc that holds it to the pole."""
     wall = 0.006
-    return parts.lathe(
-        [(upper, top), (upper - wall, top - wall), (lower - wall, bottom), (lower, bottom)][::-1]
-    )
+    inside = [(upper - wall, top - wall), (lower - wall, bottom)]
+    return parts.lathe([*inside, (lower, bottom), (upper, top)])

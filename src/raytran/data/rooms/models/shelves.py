@@ -75,18 +75,18 @@ def step_shelf(rng: np.random.Generator) -> Design:
     columns, cell, depth = int(rng.integers(3, 5)), rng.uniform(0.33, 0.4), rng.uniform(0.28, 0.36)
     side = float(rng.choice([-1.0, 1.0]))
     wood = palette.pick(rng, palette.WOODS + palette.PAINTS)
-    left = -columns * cell / 2
+    left, shelf = -columns * cell / 2, Design("steps")
+    for column in range(columns + 1):
+        # A panel between two columns is as tall as the taller one.
+        rows = columns - max(0, column - 1)
+        _upright_panels(shelf, [left + column * cell], rows * cell + BOARD, depth, wood)
     for column in range(columns):
-        rows = columns - column
-        x, height = left + (column + 0.5) * cell, rows * cell + BOARD
-        panels = [x - cell / 2, x + cell / 2] if column == columns - 1 else [x - cell / 2]
-        shelf = Design("column")
-        _upright_panels(shelf, panels, height, depth, wood)
-        for level in range(rows + 1):
-            board = parts.box((x, level * cell + BOARD / 2, 0), (cell + BOARD - 0.002, BOARD, depth - 0.004))
-            shelf.add(board, wood)
-        for part, color in shelf.parts:
-            design.add(part if side > 0 else parts.mirrored(part), color)
+        middle = left + (column + 0.5) * cell
+        for level in range(columns - column + 1):
+            board = (middle, level * cell + BOARD / 2, 0), (cell + BOARD - 0.002, BOARD, depth - 0.004)
+            shelf.add(parts.box(*board), wood)
+    for part, color in shelf.parts:
+        design.add(part if side > 0 else parts.mirrored(part), color)
     return design
 
 
