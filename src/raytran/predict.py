@@ -1,17 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m raytran.predict checkpoint=CKPT scene=FOLDER output=DIR``: a scene's objects and meshes."""
+"""Predict a scene's objects and meshes: ``python -m raytran.predict checkpoint=CKPT scene=FOLDER output=DIR``."""
 
 from __future__ import annotations
 
-from omegaconf import DictConfig
+from typing import TYPE_CHECKING
 
 from raytran.run.entry import entry_point
-from raytran.run.predict import predict
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
 
 
 @entry_point("predict")
 def main(cfg: DictConfig) -> None:
-    """Predict one scene."""
+    """Run the command."""
+    # Imported here so that --help answers at once.
+    from raytran.run.predict import predict
+
     predict(cfg)
 
 

@@ -15,6 +15,7 @@ from torch import nn
 
 from raytran.errors import CheckpointError, ConfigError, DataError
 from raytran.run import predict as module
+from raytran.run.checkpoint import PredictionSettings
 from raytran.types import ObjectSet, ScenePrediction, Views
 
 IMAGE_SIZE = (48, 64)
@@ -68,9 +69,9 @@ def scene(tmp_path):
 @pytest.fixture
 def oracle(monkeypatch) -> Oracle:
     model = Oracle()
-    card = {"views": {"image_size": list(IMAGE_SIZE), "predict_views": 96}}
-    monkeypatch.setattr(module, "read_checkpoint", lambda path: card)
-    monkeypatch.setattr(module, "model_from", lambda checkpoint, path: model)
+    settings = PredictionSettings(preset="tiny", stage="shape", image_size=IMAGE_SIZE, num_views=96)
+    monkeypatch.setattr(module, "prediction_settings", lambda path: settings)
+    monkeypatch.setattr(module, "load_model", lambda path: model)
     return model
 
 

@@ -1,42 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loss curves come out of a CSV file as they were logged."""
+"""Loss curves, one plot a stage."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from PIL import Image
 
-from raytran.errors import DataError
-from raytran.view.curves import draw_curves, read_curves
+from raytran.view.curves import draw_curves
 
-CSV = """epoch,step,train/total,train/objects/class/layer0,val/total
-0,0,4.0,1.0,
-0,0,,,3.5
-1,10,2.0,0.5,
-1,20,1.0,0.25,1.5
-"""
+FALLING = {"train/total": [(step, 4.0 / (step + 1)) for step in range(40)], "val/total": [(39, 1.0)]}
 
 
-def test_empty_cells_are_left_out(tmp_path):
-    (tmp_path / "metrics.csv").write_text(CSV)
-    curves = read_curves(tmp_path / "metrics.csv")
-    assert curves["train/total"] == ([0, 10, 20], [4.0, 2.0, 1.0])
-    assert curves["val/total"] == ([0, 20], [3.5, 1.5])
-    assert set(curves) == {"train/total", "train/objects/class/layer0", "val/total"}
+def ink(path) -> np.ndarray:
+    """Rows and columns of the dark pixels inside the plot of a single stage, legend and axes cut away."""
+    image = np.asarray(Image.open(path).convert("L"))
+    height, width = image.shape
+    inner = image[int(0.25 * height) : int(0.8 * height), int(0.2 * width) : int(0.95 * width)]
+    return np.argwhere(inner < 90)
+
+
+def test_a_falling_loss_falls_to_the_right(tmp_path):
+    rows, columns = ink(draw_curves(tmp_path / "one.png", {"occupancy": FALLING})).T
+    assert np.corrcoef(rows, columns)[0, 1] > 0.8
 
 
 def test_one_plot_a_stage(tmp_path):
-    (tmp_path / "metrics.csv").write_text(CSV)
-    curves = read_curves(tmp_path / "metrics.csv")
-    one = draw_curves(tmp_path / "one.png", {"occupancy": curves})
-    three = draw_curves(tmp_path / "three.png", {"occupancy": curves, "joint": curves, "shape": {}})
-    assert Image.open(three).width == pytest.approx(3 * Image.open(one).width, abs=3)
+    one = Image.open(draw_curves(tmp_path / "one.png", {"occupancy": FALLING}))
+    stages = {"occupancy": FALLING, "joint": FALLING, "shape": {}}
+    three = Image.open(draw_curves(tmp_path / "three.png", stages))
+    assert three.width == pytest.approx(3 * one.width, abs=3)
 
 
-@pytest.mark.parametrize("content", [None, "epoch,step,train/total\n0,0,many\n"])
-def test_a_damaged_file_is_named(tmp_path, content):
-    path = tmp_path / "metrics.csv"
-    if content is not None:
-        path.write_text(content)
-    with pytest.raises(DataError, match=r"cannot read loss curves from .*metrics\.csv"):
-        read_curves(path)
+def test_earlier_decoder_layers_and_validation_are_left_out(tmp_path):
+    more = FALLING | {"train/objects/class/layer0": [(step, 900.0) for step in range(40)]}
+    same = [
+        draw_curves(tmp_path / f"{n}.png", {"joint": h}).read_bytes() for n, h in enumerate([FALLING, more])
+    ]
+    assert same[0] == same[1]

@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
 import trimesh
 from omegaconf import DictConfig
 
@@ -18,9 +17,9 @@ from raytran.export import write_prediction
 from raytran.geometry.camera import Cameras
 from raytran.model import RayTran
 from raytran.postprocess import object_meshes, select_objects
-from raytran.run.checkpoint import model_from
+from raytran.run.checkpoint import load_model, prediction_settings
+from raytran.run.device import choose_device
 from raytran.run.output import check_replaceable, replaced_folder
-from raytran.training.checkpoint_file import read_checkpoint
 from raytran.types import ObjectSet, ScenePrediction, Views
 from raytran.view.overlay import draw_overlays
 from raytran.view.topdown import draw_topdown
@@ -30,7 +29,14 @@ _LOG = logging.getLogger(__name__)
 _IMPORTERS = {"auto": load_views, "scannet": load_views}
 """Name of a folder's layout → reader of its views."""
 
+_UNTRAINED = {
+    "occupancy": "its objects mean nothing yet; predict with a checkpoint of stage shape",
+    "joint": "its meshes mean nothing yet; predict with a checkpoint of stage shape",
+}
+"""Stage of the curriculum that is not the last → what to expect of its checkpoints."""
+
 MARKER = "scene.json"
+"""The file that tells a finished result."""
 
 
 @dataclass(frozen=True)
@@ -55,11 +61,14 @@ def predict(cfg: DictConfig) -> Path:
     scene, output = Path(cfg.scene).resolve(), Path(cfg.output)
     read_views = _importer(cfg.format)
     check_replaceable(output.resolve(), marker=MARKER)
-    checkpoint = read_checkpoint(Path(cfg.checkpoint))
-    model = model_from(checkpoint, Path(cfg.checkpoint)).to(_device(cfg.device))
-    height, width = checkpoint["views"]["image_size"]
-    num_views = cfg.num_views or checkpoint["views"]["predict_views"]
-    views, frame_ids = _without_repeats(*read_views(scene, image_size=(height, width), num_views=num_views))
+    settings = prediction_settings(cfg.checkpoint)
+    if settings.stage in _UNTRAINED:
+        _LOG.warning("%s is of stage %s: %s", cfg.checkpoint, settings.stage, _UNTRAINED[settings.stage])
+    model = load_model(cfg.checkpoint).to(choose_device(cfg.device))
+    num_views = cfg.num_views or settings.num_views
+    views, frame_ids = _without_repeats(
+        *read_views(scene, image_size=settings.image_size, num_views=num_views)
+    )
     found = predict_scene(
         model,
         views,
@@ -82,7 +91,7 @@ def predict_scene(
         views: B = 1.
         scene_id: name to give the result.
         score_threshold: objects with a lower score are left out.
-        duplicate_iou: of two objects of a class whose box IoU is higher, the weaker is left out; None keeps both.
+        duplicate_iou: of two objects of a class with a higher box IoU, the weaker is left out; None: neither.
 
     Returns:
         The result, on the CPU.
@@ -139,19 +148,6 @@ def _without_repeats(views: Views, frame_ids: Sequence[str]) -> tuple[Views, tup
     kept = sorted(first.values())
     views = Views(views.images[:, kept], views.intrinsics[:, kept], views.world_from_camera[:, kept])
     return views, tuple(frame_ids[n] for n in kept)
-
-
-def _device(name: str) -> torch.device:
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        device = torch.device(name)
-        torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
-        raise ConfigError(
-            f"cannot use device={name} ({str(error).splitlines()[0]}): choose auto or cpu"
-        ) from error
-    return device
 
 
 def _report(output: Path, found: PredictedScene) -> None:

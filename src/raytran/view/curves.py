@@ -1,64 +1,44 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loss curves from the ``metrics.csv`` of each fit."""
+"""Loss curves of the fits of a curriculum."""
 
 from __future__ import annotations
 
-import csv
-from collections import defaultdict
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from raytran.errors import DataError
 from raytran.view.palette import FAINT, INK
 
-Curves = dict[str, tuple[list[int], list[float]]]
-"""Column name → optimiser steps and values."""
+History = Mapping[str, Sequence[tuple[int, float]]]
+"""Name of a logged value → (optimiser step, value) pairs by rising step."""
+
+_SMOOTHED = 12
+"""Steps logged on which a running mean is taken, at most; each scene's loss has a level of its own."""
 
 
-def read_curves(path: Path) -> Curves:
-    """Read the columns of a ``metrics.csv`` as Lightning's ``CSVLogger`` writes it, empty cells left out.
-
-    Raises:
-        DataError: the file is missing or holds something that is not a number.
-    """
-    curves: Curves = defaultdict(lambda: ([], []))
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            for row in csv.DictReader(file):
-                for name, cell in row.items():
-                    if name not in ("step", "epoch") and cell:
-                        curves[name][0].append(int(float(row["step"])))
-                        curves[name][1].append(float(cell))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"cannot read loss curves from {path} ({error}); train that stage again") from error
-    return dict(curves)
-
-
-def draw_curves(path: Path, stages: Mapping[str, Curves], *, prefix: str = "train/") -> Path:
+def draw_curves(path: Path, stages: Mapping[str, History], *, prefix: str = "train/") -> Path:
     """Draw the terms of the loss, one plot per stage, on a logarithmic scale.
+
+    A line is the running mean of a term's values, which lie faintly behind.
 
     Args:
         path: PNG file.
-        stages: name of each stage, in order → its curves.
-        prefix: what the names of the curves to draw begin with; the rest of a name is its label. Names with a
-            ``layer`` part, the losses at the decoder's earlier layers, are left out.
+        stages: name of each stage, in order → what it logged.
+        prefix: what the names of values to draw begin with; the rest of a name is its label. The losses at
+            the decoder's earlier layers (a part of the name begins with ``layer``) are left out.
     """
-    figure = Figure(
-        figsize=(4.4 * max(len(stages), 1), 3.6), dpi=120, layout="constrained", facecolor="white"
-    )
-    plots = figure.subplots(1, max(len(stages), 1), squeeze=False)[0]
-    for axes, (stage, curves) in zip(plots, stages.items(), strict=False):
-        for name in sorted(curves):
-            label = name.removeprefix(prefix)
-            if name == label or "layer" in label:
-                continue
-            steps, values = curves[name]
-            total = label == "total"
-            axes.plot(
-                steps, values, label=label, color=INK if total else None, linewidth=2.0 if total else 1.2
-            )
+    columns = max(len(stages), 1)
+    figure = Figure(figsize=(4.4 * columns, 3.8), dpi=120, layout="constrained", facecolor="white")
+    plots = figure.subplots(1, columns, squeeze=False)[0]
+    for axes, (stage, history) in zip(plots, stages.items(), strict=False):
+        terms = [name.removeprefix(prefix) for name in sorted(history) if name.startswith(prefix)]
+        terms = [term for term in terms if "/layer" not in term]
+        # One term alone is the total.
+        for term in terms if len(terms) > 2 else [term for term in terms if term == "total"]:
+            _draw_term(axes, term, history[prefix + term])
         axes.set_yscale("log")
         axes.set_title(stage, loc="left", color=INK, fontsize=11)
         axes.set_xlabel("step", color=INK)
@@ -66,6 +46,18 @@ def draw_curves(path: Path, stages: Mapping[str, Curves], *, prefix: str = "trai
         axes.grid(color="#e6e9ee", linewidth=0.6)
         axes.spines[:].set_color("#c9cfd8")
         if axes.lines:
-            axes.legend(frameon=False, fontsize=8, labelcolor=INK)
+            axes.legend(frameon=False, fontsize=8, labelcolor=INK, ncols=2, loc="upper right")
     figure.savefig(path)
     return path
+
+
+def _draw_term(axes: Axes, term: str, pairs: Sequence[tuple[int, float]]) -> None:
+    steps, values = np.array(pairs).T
+    window = max(1, min(_SMOOTHED, len(values) // 8))
+    smooth = np.convolve(values, np.ones(window) / window, mode="valid")
+    total = term == "total"
+    (line,) = axes.plot(
+        steps[window - 1 :], smooth, label=term, color=INK if total else None, linewidth=2.0 if total else 1.3
+    )
+    if window > 1:
+        axes.plot(steps, values, color=line.get_color(), linewidth=0.6, alpha=0.18)
