@@ -95,10 +95,11 @@ def box_iou(a: OrientedBoxes, b: OrientedBoxes) -> tuple[Tensor, Tensor]:
     check_shape(a.center, "A 3", "center of the first boxes")
     check_shape(b.center, "B 3", "center of the second boxes")
     dtype = torch.float32 if a.center.device.type == "mps" else torch.float64
-    return _box_iou(_frames(a, dtype), _frames(b, dtype))
+    return _box_iou(a, b, dtype)
 
 
-def _box_iou(a: _Frames, b: _Frames) -> tuple[Tensor, Tensor]:
+def _box_iou(first: OrientedBoxes, second: OrientedBoxes, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    a, b = _frames(first, second, dtype)
     pair_a, pair_b = _near_pairs(a, b)
     chunk = _PAIRS_PER_CHUNK_CPU if pair_a.device.type == "cpu" else _PAIRS_PER_CHUNK
     shared = [
@@ -111,19 +112,22 @@ def _box_iou(a: _Frames, b: _Frames) -> tuple[Tensor, Tensor]:
     return intersection / union, intersection
 
 
-def _frames(boxes: OrientedBoxes, dtype: torch.dtype) -> _Frames:
-    """Return the frames of boxes ``(n,)``. A box that is not solid becomes a unit cube without gradient."""
-    center, size, rotation = (value.to(dtype) for value in (boxes.center, boxes.size, boxes.rotation))
-    matrix = (rotation * (size / 2)[:, None, :]).permute(1, 2, 0)
-    with torch.no_grad():
-        inverse, determinant = _invert(matrix)
-        finite = torch.cat([center.T, inverse.flatten(0, 1), determinant[None]]).isfinite().all(dim=0)
-        solid = finite & (determinant != 0)
-    cube = torch.eye(3, dtype=dtype, device=center.device)[:, :, None]
-    matrix = torch.where(solid, matrix, cube)
-    center = torch.where(solid, center.T, 0.0)
+def _frames(first: OrientedBoxes, second: OrientedBoxes, dtype: torch.dtype) -> tuple[_Frames, _Frames]:
+    """Return the frames of two sets of boxes. A box that is not solid becomes a cube without gradient."""
+    center = torch.cat([first.center, second.center]).to(dtype)
+    size = torch.cat([first.size, second.size]).to(dtype)
+    rotation = torch.cat([first.rotation, second.rotation]).to(dtype)
+    center, matrix = center.T, (rotation * (size / 2)[:, None, :]).permute(1, 2, 0)
     inverse, determinant = _invert(matrix)
-    return _Frames(center, matrix, inverse, determinant.abs(), solid)
+    finite = torch.cat([center, inverse.flatten(0, 1), determinant[None]]).isfinite().all(dim=0)
+    solid = finite & (determinant != 0)
+    if not solid.all():
+        cube = torch.eye(3, dtype=dtype, device=center.device)[:, :, None]
+        center, matrix = torch.where(solid, center, 0.0), torch.where(solid, matrix, cube)
+        inverse, determinant = _invert(matrix)
+    both = _Frames(center, matrix, inverse, determinant.abs(), solid)
+    count = first.center.shape[0]
+    return _Frames(*(value[..., :count] for value in both)), _Frames(*(value[..., count:] for value in both))
 
 
 def _invert(matrix: Tensor) -> tuple[Tensor, Tensor]:
