@@ -77,7 +77,7 @@ def write_cube(tmp_path: Path) -> Callable[..., Path]:
 
 @pytest.fixture
 def cube_entry() -> Callable[..., dict]:
-    """An entry of ``aligned_models``: a cube that stands upright in a scan whose annotation frame is its own."""
+    """Make an entry of ``aligned_models``: a cube, upright if the annotation frame is the scan's."""
 
     def entry(translation=(3.0, 0.0, 1.0), scale=(1.0, 1.0, 1.0), **fields) -> dict:
         half = 0.5**0.5

@@ -63,7 +63,7 @@ def test_views_are_resized_with_their_intrinsics(write_scan) -> None:
 
 
 def test_missing_parts_are_named(write_scan, tmp_path) -> None:
-    with pytest.raises(DataError, match="there is no scan folder .*nowhere"):
+    with pytest.raises(DataError, match=r"there is no scan folder .*nowhere"):
         read_scan(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match="has no folder color"):
@@ -79,7 +79,7 @@ def test_all_poses_invalid(write_scan) -> None:
     for path in (folder / "pose").iterdir():
         np.savetxt(path, np.full((4, 4), -np.inf))
     with pytest.raises(
-        DataError, match="none of the 4 frames in .*scene0000_00 has an image and a valid pose"
+        DataError, match=r"none of the 4 frames in .*scene0000_00 has an image and a valid pose"
     ):
         read_scan(folder)
 

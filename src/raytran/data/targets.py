@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from raytran.data.cache import MaskCache, digest, file_digest
-from raytran.data.shapenet import mesh_path, read_mesh
+from raytran.data.shapenet import STEM, model_folder, read_mesh
 from raytran.data.voxelize import voxelize_solid
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
@@ -39,7 +39,7 @@ def shape_grids(model_ids: tuple[str, ...], *, shapenet_root: Path, cache: MaskC
     """
     grids = np.zeros((len(model_ids), SHAPE_SIZE, SHAPE_SIZE, SHAPE_SIZE), dtype=bool)
     for grid, model_id in zip(grids, model_ids, strict=True):
-        content = file_digest(mesh_path(shapenet_root, *model_id.split("/")))
+        content = _content(shapenet_root, model_id)
         key = digest(_VERSION, SHAPE_SIZE, content)
         stored = cache.read("shape", key, grid.shape)
         if stored is None:
@@ -90,7 +90,7 @@ def foreground_masks(
     Raises:
         DataError: a CAD file is missing or cannot be read.
     """
-    contents = [file_digest(mesh_path(shapenet_root, *model_id.split("/"))) for model_id in objects.model_id]
+    contents = [_content(shapenet_root, model_id) for model_id in objects.model_id]
     scene = digest(_VERSION, contents, *(t.numpy() for t in (objects.center, objects.size, objects.rotation)))
     intrinsics, world_from_camera = cameras.intrinsics.numpy(), cameras.world_from_camera.numpy()
     keys = [
@@ -109,6 +109,11 @@ def foreground_masks(
         for i in missing:
             cache.write("foreground", keys[i], masks[i])
     return torch.from_numpy(masks)
+
+
+def _content(shapenet_root: Path, model_id: str) -> str:
+    """Return a digest of a model's mesh file."""
+    return file_digest(model_folder(shapenet_root, *model_id.split("/")) / f"{STEM}.obj")
 
 
 @lru_cache(maxsize=64)

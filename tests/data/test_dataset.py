@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From files to batches: targets, determinism, workers, and what is said when something is missing."""
+
+from __future__ import annotations
+
+import pickle
+import shutil
+
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from raytran.data.collate import collate_scenes
+from raytran.data.dataset import SceneDataset, scan2cad_dataset
+from raytran.data.scannet import load_views
+from raytran.errors import ConfigError, DataError
+from raytran.types import SHAPE_SIZE
+
+SMALL = {"image_size": (32, 48), "num_views": 2, "grid_resolution": (8, 8, 4), "grid_extent": (8.0, 8.0, 4.0)}
+
+
+def open_dataset(root, split="train", **options):
+    return scan2cad_dataset(root, split, **{"cache_dir": root / "cache", **SMALL, **options})
+
+
+def test_all_targets(cube_dataset) -> None:
+    sample = open_dataset(cube_dataset, view_choice="even")[0]
+    assert sample.scene_id == ("scene0000_00",)
+    assert sample.frame_id == (("10", "100"),)
+    assert sample.views.images.shape == (1, 2, 3, 32, 48)
+    assert sample.views.images[0, :, 0, 0, 0].tolist() == [10, 100]
+    # Cameras stand at x = 0.1 and x = 1.
+    torch.testing.assert_close(sample.grid_center, torch.tensor([[0.55, 0.0, 1.0]]))
+    (objects,) = sample.objects
+    torch.testing.assert_close(objects.center, torch.tensor([[3.0, 0.0, 1.0]]))
+    assert objects.shape.shape == (1, SHAPE_SIZE, SHAPE_SIZE, SHAPE_SIZE)
+    assert objects.shape.all()
+    # In the grid from (-3.45, -4, -1), voxels of 1 m: the cube spans x 5.95 … 6.95, y 3.5 … 4.5, z 1.5 … 2.5.
+    expected = torch.zeros(1, 8, 8, 4, dtype=torch.bool)
+    expected[0, 5:7, 3:5, 1:3] = True
+    assert torch.equal(sample.occupancy, expected)
+    # Near faces are 2.4 m and 1.5 m ahead: 16.7 and 26.7 pixels wide.
+    assert sample.foreground.sum(dim=(2, 3)).tolist() == [[16 * 16, 26 * 26]]
+
+
+def test_only_targets_that_were_asked_for(cube_dataset) -> None:
+    sample = open_dataset(cube_dataset, targets=("occupancy",))[0]
+    assert sample.objects is None
+    assert sample.foreground is None
+    assert sample.occupancy.any()
+    sample = open_dataset(cube_dataset, targets=("objects", "occupancy"))[0]
+    assert sample.objects[0].shape is None
+    assert sample.occupancy.any()
+    sample = open_dataset(cube_dataset, targets=())[0]
+    assert sample.occupancy is None
+    assert sample.views.images.shape[2] == 3
+
+
+def test_mask_as_input(cube_dataset) -> None:
+    sample = open_dataset(cube_dataset, targets=("foreground",), input_mask=True)[0]
+    assert sample.views.images.shape == (1, 2, 4, 32, 48)
+    assert torch.equal(sample.views.images[:, :, 3], sample.foreground.byte() * 255)
+
+
+def test_second_reading_comes_from_the_cache_and_is_equal(cube_dataset) -> None:
+    first = open_dataset(cube_dataset, view_choice="even")[0]
+    entries = {path: path.stat().st_mtime_ns for path in (cube_dataset / "cache").rglob("*.z")}
+    assert len(entries) == 3
+    second = open_dataset(cube_dataset, view_choice="even")[0]
+    assert {path: path.stat().st_mtime_ns for path in (cube_dataset / "cache").rglob("*.z")} == entries
+    assert torch.equal(first.foreground, second.foreground)
+    assert torch.equal(first.objects[0].shape, second.objects[0].shape)
+
+
+def test_predict_sees_the_same_frames_as_even_choice(cube_dataset) -> None:
+    sample = open_dataset(cube_dataset, view_choice="even", num_views=3)[0]
+    folder = cube_dataset / "scannet" / "scans" / "scene0000_00"
+    views, frame_id = load_views(folder, image_size=(32, 48), num_views=3)
+    assert frame_id == sample.frame_id[0]
+    assert torch.equal(views.images, sample.views.images)
+    assert torch.equal(views.intrinsics, sample.views.intrinsics)
+
+
+@pytest.fixture
+def long_dataset(write_scan, write_cube, write_annotations, cube_entry, tmp_path):
+    """Two scans of 30 frames."""
+    write_cube()
+    for name in ("scene0000_00", "scene0001_00"):
+        write_scan(name, frames=range(30))
+    write_annotations({name: [cube_entry()] for name in ("scene0000_00", "scene0001_00", "scene0002_00")})
+    return tmp_path
+
+
+def test_random_frames_depend_on_seed_epoch_and_index_alone(long_dataset) -> None:
+    def frames(seed=0, epoch=0, index=0):
+        dataset = open_dataset(long_dataset, num_views=6, targets=(), seed=seed)
+        dataset.set_epoch(epoch)
+        return dataset[index].frame_id[0]
+
+    assert frames() == frames()
+    assert len({frames(), frames(seed=1), frames(epoch=1), frames(index=1)}) == 4
+
+
+def test_workers_give_what_the_process_itself_gives_in_every_epoch(long_dataset) -> None:
+    dataset = open_dataset(long_dataset, num_views=6)
+    loader = DataLoader(
+        dataset, batch_size=2, num_workers=2, collate_fn=collate_scenes, persistent_workers=True
+    )
+    seen = []
+    for epoch in range(3):
+        dataset.set_epoch(epoch)
+        (batch,) = loader
+        expected = collate_scenes([dataset[0], dataset[1]])
+        assert batch.frame_id == expected.frame_id
+        assert torch.equal(batch.views.images, expected.views.images)
+        assert torch.equal(batch.foreground, expected.foreground)
+        assert torch.equal(batch.occupancy, expected.occupancy)
+        seen.append(batch.frame_id)
+    assert len(set(seen)) == 3
+
+
+def test_dataset_can_be_pickled(long_dataset) -> None:
+    dataset = open_dataset(long_dataset, num_views=6, targets=())
+    dataset.set_epoch(5)
+    assert pickle.loads(pickle.dumps(dataset))[0].frame_id == dataset[0].frame_id
+
+
+def test_scan_with_too_few_frames_repeats_them(cube_dataset) -> None:
+    for choice in ("random", "even"):
+        sample = open_dataset(cube_dataset, num_views=8, view_choice=choice, targets=())[0]
+        assert sorted(sample.frame_id[0]) == sorted(("0", "10", "20", "100") * 2)
+
+
+def test_split_is_what_is_listed_and_annotated(long_dataset) -> None:
+    (long_dataset / "scannet" / "scannetv2_train.txt").write_text("scene0001_00\nscene0009_00\n")
+    (long_dataset / "scannet" / "scannetv2_val.txt").write_text("scene0000_00\n")
+    assert open_dataset(long_dataset, "train").scene_ids == ("scene0001_00",)
+    assert open_dataset(long_dataset, "val").scene_ids == ("scene0000_00",)
+    with pytest.raises(DataError, match=r"scannetv2_test\.txt"):
+        open_dataset(long_dataset, "test")
+    (long_dataset / "scannet" / "scannetv2_val.txt").write_text("scene0009_00\n")
+    with pytest.raises(DataError, match=r"no scene with objects in .*full_annotations\.json"):
+        open_dataset(long_dataset, "val")
+    (long_dataset / "scannet" / "scannetv2_val.txt").write_text("scene0002_00\n")
+    with pytest.raises(DataError, match=r"1 of 1 scans are not in .* scene0002_00"):
+        open_dataset(long_dataset, "val")
+
+
+def test_without_split_files_all_annotated_scans_that_are_there(long_dataset) -> None:
+    assert open_dataset(long_dataset).scene_ids == ("scene0000_00", "scene0001_00")
+
+
+def test_empty_annotation(cube_dataset, write_annotations) -> None:
+    for scenes in ({}, {"scene0000_00": []}):
+        write_annotations(scenes)
+        with pytest.raises(DataError, match=r"no scene with objects in .*full_annotations\.json"):
+            open_dataset(cube_dataset)
+
+
+def test_missing_folders(tmp_path, cube_dataset) -> None:
+    with pytest.raises(DataError, match=r"there is no folder .*nowhere"):
+        open_dataset(tmp_path / "nowhere")
+    shutil.rmtree(cube_dataset / "shapenet")
+    with pytest.raises(DataError, match="03001627"):
+        _ = open_dataset(cube_dataset)[0]
+
+
+def test_settings_that_contradict_each_other(cube_dataset) -> None:
+    with pytest.raises(ConfigError, match="unknown targets"):
+        open_dataset(cube_dataset, targets=("boxes",))
+    with pytest.raises(ConfigError, match="view_choice"):
+        open_dataset(cube_dataset, view_choice="first")
+    paths = {"scans_root": cube_dataset / "scannet" / "scans", "cache_dir": cube_dataset / "cache"}
+    with pytest.raises(ConfigError, match="annotations"):
+        SceneDataset(**paths)
+    with pytest.raises(ConfigError, match="shapenet_root"):
+        SceneDataset(**paths, annotations=cube_dataset / "scan2cad" / "full_annotations.json")
+
+
+def test_scans_without_annotation(cube_dataset) -> None:
+    paths = {"scans_root": cube_dataset / "scannet" / "scans", "cache_dir": cube_dataset / "cache"}
+    dataset = SceneDataset(**paths, targets=(), **SMALL)
+    assert dataset.scene_ids == ("scene0000_00",)
+    assert dataset[0].objects is None
+
+
+def test_real_scan(shared_dir, tmp_path) -> None:
+    root = shared_dir / "realdata" / "scene0470_00"
+    dataset = scan2cad_dataset(root, "train", cache_dir=tmp_path, image_size=(120, 160), num_views=4)
+    assert dataset.scene_ids == ("scene0470_00",)
+    sample = dataset[0]
+    assert len(sample.objects[0]) == 7
+    assert sample.occupancy.shape == (1, 48, 48, 16)
+    # Seven pieces of furniture fill little of 9 × 9 × 3.5 m.
+    assert 7 < sample.occupancy.sum() < 1500
+    assert sample.foreground.shape == (1, 4, 120, 160)
+
+
+def test_real_walk_without_annotation(shared_dir, tmp_path) -> None:
+    scans = shared_dir / "realdata" / "hololens_lounge" / "scans"
+    dataset = SceneDataset(
+        scans_root=scans, cache_dir=tmp_path, targets=(), num_views=2, image_size=(120, 160)
+    )
+    assert dataset.scene_ids == ("hololens_000",)
+    assert dataset[0].views.images.shape == (1, 2, 3, 120, 160)
