@@ -1,4 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
 """RayTran: every object of a room, with class, 9-DoF pose and mesh, from a posed RGB video."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from raytran.model import RayTran
+
 __version__ = "0.1.0"
+
+
+def load(checkpoint: str | Path) -> RayTran:
+    """Return the model of a checkpoint, in evaluation mode, on the CPU.
+
+    Args:
+        checkpoint: a ``.ckpt`` file that training wrote.
+
+    Raises:
+        CheckpointError: the file is missing or damaged.
+    """
+    # Imported here so that ``import raytran`` stays light.
+    from raytran.run.checkpoint import load_model
+
+    return load_model(checkpoint)

@@ -1,0 +1,24 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Train the three stages one after another: ``python -m raytran.curriculum preset=raytran|small|tiny``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from raytran.run.entry import entry_point
+
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+
+@entry_point("curriculum")
+def main(cfg: DictConfig) -> None:
+    """Run the command."""
+    # Imported here so that --help answers at once.
+    from raytran.run.curriculum import curriculum
+
+    curriculum(cfg)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Models out of checkpoints: the config inside says how to build them, the weights fill them."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from raytran.errors import CheckpointError
+from raytran.training.checkpoint_file import FORMAT, read_checkpoint
+
+if TYPE_CHECKING:
+    from raytran.model import RayTran
+
+_PREFIX = "model."
+
+
+def checkpoint_card(
+    *, stage: str, preset: str, model: Mapping[str, Any], views: Mapping[str, Any], parent: str | None
+) -> dict[str, Any]:
+    """Return the plain Python that identifies a checkpoint.
+
+    Args:
+        stage: name of the stage.
+        preset: name of the preset.
+        model: resolved config of the model.
+        views: ``image_size`` [H, W], ``num_views`` in training and ``predict_views``.
+        parent: path of the checkpoint that the fit started from, or None.
+    """
+    from raytran.run.provenance import git_commit, versions
+
+    return {
+        "format": FORMAT,
+        "stage": stage,
+        "preset": preset,
+        "model": dict(model),
+        "views": dict(views),
+        "parent": parent,
+        "git_commit": git_commit(),
+        "versions": versions(),
+    }
+
+
+def load_model(path: str | Path) -> RayTran:
+    """Return the model of a checkpoint, in evaluation mode, on the CPU.
+
+    Raises:
+        CheckpointError: the file is missing, damaged, or its weights do not fit the model described in it.
+    """
+    return model_from(read_checkpoint(Path(path)), Path(path))
+
+
+@dataclass(frozen=True)
+class PredictionSettings:
+    """What a checkpoint says about the images it wants.
+
+    Attributes:
+        preset: name of the preset it was trained with.
+        stage: name of the stage.
+        image_size: ``(H, W)``.
+        num_views: frames to predict from (96 in the paper).
+    """
+
+    preset: str
+    stage: str
+    image_size: tuple[int, int]
+    num_views: int
+
+
+def prediction_settings(path: str | Path) -> PredictionSettings:
+    """Read how a checkpoint is to be used.
+
+    Raises:
+        CheckpointError: the file is missing or damaged.
+    """
+    card = read_checkpoint(Path(path))
+    height, width = card["views"]["image_size"]
+    return PredictionSettings(card["preset"], card["stage"], (height, width), card["views"]["predict_views"])
+
+
+def model_from(checkpoint: Mapping[str, Any], path: Path) -> RayTran:
+    """Return the model of a checkpoint that was read from ``path`` already."""
+    from hydra.utils import instantiate
+
+    config = copy.deepcopy(checkpoint["model"])
+    for target in _targets(config):
+        if not target.startswith("raytran."):
+            raise CheckpointError(
+                f"{path} asks to run '{target}', which is not part of raytran: do not use this file"
+            )
+    # The weights are in the checkpoint: nothing is to be fetched.
+    config.get("backbone", {}).get("resnet", {})["weights"] = None
+    model = cast("RayTran", instantiate(config, _convert_="all"))
+    load_weights(model, checkpoint, path)
+    return model.eval()
+
+
+def load_weights(model: RayTran, checkpoint: Mapping[str, Any], path: Path) -> None:
+    """Fill ``model`` with the weights of a checkpoint.
+
+    Raises:
+        CheckpointError: names or shapes differ.
+    """
+    state = {
+        name.removeprefix(_PREFIX): value
+        for name, value in checkpoint["state_dict"].items()
+        if name.startswith(_PREFIX)
+    }
+    try:
+        model.load_state_dict(state)
+    except RuntimeError as error:
+        reason = str(error).splitlines()[-1].strip()
+        raise CheckpointError(
+            f"the weights in {path} (preset {checkpoint['preset']}) do not fit this model ({reason}): "
+            "choose the preset and model settings that the checkpoint was trained with"
+        ) from error
+
+
+def _targets(config: Any) -> list[str]:
+    """Return all ``_target_`` values inside a nested config."""
+    if isinstance(config, Mapping):
+        own = [str(config["_target_"])] if "_target_" in config else []
+        return own + [target for value in config.values() for target in _targets(value)]
+    if isinstance(config, list | tuple):
+        return [target for value in config for target in _targets(value)]
+    return []

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What all commands share: Hydra around a function, errors of the user's making as one sentence."""
+
+from __future__ import annotations
+
+import functools
+import os
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import hydra
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import InstantiationException
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from raytran.errors import ConfigError, RaytranError
+from raytran.run.config_dir import config_dir
+from raytran.run.folders import register_resolvers
+
+
+def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], Any]]:
+    """Turn ``function(cfg)`` into a command configured by ``conf/<config_name>.yaml``.
+
+    ``cfg.output_dir``, where there is one, is set to the absolute folder of this run. A ``RaytranError`` is printed as one sentence
+    and the command exits with 1; any other exception is a defect and shows its traceback.
+    """
+    register_resolvers()
+
+    def decorate(function: Callable[[DictConfig], Any]) -> Callable[[], Any]:
+        @functools.wraps(function)
+        def task(cfg: DictConfig) -> Any:
+            if "output_dir" in cfg:
+                # Lightning starts further ranks with hydra.run.dir of the first: all share one folder.
+                cfg.output_dir = HydraConfig.get().runtime.output_dir
+            return run_or_exit(function, cfg)
+
+        try:
+            main = hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=config_name)
+        except ConfigError as error:
+            _exit_with(error)
+        return main(task)
+
+    return decorate
+
+
+def run_or_exit(function: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
+    """Return ``function(cfg)``; a mistake of the user's becomes a sentence on stderr and exit code 1."""
+    try:
+        return function(cfg)
+    except RaytranError as error:
+        _exit_with(error)
+    except InstantiationException as error:
+        # Hydra wraps what a constructor raised; a message of ours is clearer without the wrapping.
+        if isinstance(error.__cause__, RaytranError):
+            _exit_with(error.__cause__)
+        raise
+    except OmegaConfBaseException as error:
+        _exit_with(ConfigError(f"{str(error).splitlines()[0]} (see --cfg job for all settings)"))
+
+
+def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
+    """Compose a config as the command line would, inside a running command or in plain Python.
+
+    Args:
+        config_name: root file in ``conf/`` without ending.
+        overrides: what a user would type, e.g. ``["preset=tiny", "experiment=stage2"]``. ``output_dir`` must be
+            among them if the result is to be run.
+    """
+    register_resolvers()
+    if GlobalHydra.instance().is_initialized():
+        return hydra.compose(config_name, overrides=list(overrides))
+    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
+        return hydra.compose(config_name, overrides=list(overrides))
+
+
+def _exit_with(error: RaytranError) -> None:
+    sys.stderr.write(f"raytran: {error}\n")
+    sys.stderr.flush()
+    if os.environ.get("HYDRA_FULL_ERROR") == "1":
+        raise error
+    raise SystemExit(1)

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How good a model is on annotated scenes: numbers in all, by scene and by object."""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from torch.utils.data import Dataset
+
+from raytran.metrics.records import Row
+from raytran.model import RayTran
+from raytran.run.build import build_data
+from raytran.run.checkpoint import load_model, prediction_settings
+from raytran.run.device import choose_device
+from raytran.run.entry import compose
+from raytran.run.output import check_replaceable, replaced_folder
+from raytran.training.scores import DUPLICATE_IOU, SCORE_THRESHOLD, SceneScores
+from raytran.types import SceneBatch
+
+_log = logging.getLogger(__name__)
+
+MARKER = "metrics.json"
+TASKS = ("objects", "occupancy", "foreground")
+
+
+def evaluate(cfg: DictConfig) -> dict[str, Any]:
+    """Run ``python -m raytran.evaluate``; see ``conf/evaluate.yaml``.
+
+    Returns:
+        The content of ``metrics.json``.
+
+    Raises:
+        CheckpointError: the checkpoint is missing or damaged.
+        DataError: the data are missing or damaged.
+        ConfigError: ``output`` holds something that is no earlier result.
+    """
+    output = Path(cfg.output)
+    check_replaceable(output.resolve(), marker=MARKER)
+    settings = prediction_settings(cfg.checkpoint)
+    model = load_model(cfg.checkpoint).to(choose_device(cfg.device))
+    overrides = list(HydraConfig.get().overrides.task)
+    if not any(item.startswith("preset=") for item in overrides):
+        cfg = compose("evaluate", [*overrides, f"preset={settings.preset}"])
+    # The checkpoint, not the preset, says which images and which grid its model was made for.
+    cfg.views.image_size = list(settings.image_size)
+    cfg.views.num_views = cfg.num_views or settings.num_views
+    cfg.model.grid_resolution, cfg.model.grid_extent = list(model.grid_resolution), list(model.grid_extent)
+    data = build_data(cfg)
+    data.prepare_data()
+    metrics = evaluate_model(
+        model,
+        data.split(cfg.split),
+        output=output,
+        score_threshold=cfg.score_threshold,
+        duplicate_iou=cfg.duplicate_iou,
+        about={"checkpoint": str(cfg.checkpoint), "data": str(data.root), "split": cfg.split},
+    )
+    Console().print(metrics_table(metrics, title=f"{settings.preset}, {cfg.split} scenes of {data.root}"))
+    _log.info("wrote %s: metrics.json, per_scene.csv, per_object.csv", output.resolve())
+    return metrics
+
+
+def evaluate_model(
+    model: RayTran,
+    dataset: Dataset[SceneBatch],
+    *,
+    output: Path | None = None,
+    score_threshold: float = SCORE_THRESHOLD,
+    duplicate_iou: float | None = DUPLICATE_IOU,
+    about: Mapping[str, str] | None = None,
+    progress: bool = True,
+) -> dict[str, Any]:
+    """Predict every scene of a data set and compare with its annotation.
+
+    Args:
+        model: the network, on any device; put in evaluation mode.
+        dataset: scenes with targets, each a ``SceneBatch`` with B = 1.
+        output: folder for ``metrics.json``, ``per_scene.csv`` and ``per_object.csv``, which appear together or not
+            at all; None writes nothing.
+        score_threshold: objects with a lower score do not count as predicted.
+        duplicate_iou: nor does one that overlaps a surer one of its class by more than this IoU.
+        about: what to say beside the numbers, e.g. the checkpoint.
+        progress: show a progress bar.
+
+    Returns:
+        ``scan2cad`` and ``box_f1`` with protocol and counts as in ``raytran.metrics``, ``occupancy_iou``,
+        ``foreground_iou`` and what ``about`` says.
+    """
+    device = next(model.parameters()).device
+    scores = SceneScores(tasks=TASKS, score_threshold=score_threshold, duplicate_iou=duplicate_iou).to(device)
+    model.eval()
+    for index in track(range(len(dataset)), "evaluating", disable=not progress, transient=True):  # type: ignore[arg-type]
+        batch = dataset[index].to(device)
+        with torch.no_grad():
+            raw = model(batch.views, tasks=TASKS, grid_center=batch.grid_center)
+            scores.update(batch, model.decode(raw, batch.scene_id, with_shapes=False))
+    found = scores.results()
+    metrics: dict[str, Any] = dict(about or {})
+    metrics |= {"score_threshold": score_threshold, "duplicate_iou": duplicate_iou}
+    metrics["scan2cad"] = {"protocol": "strict", **found["accuracy"]}
+    metrics["box_f1"] = {"protocol": "strict", **found["box_f1"]}
+    metrics |= {f"{task}_iou": found[task] for task in ("occupancy", "foreground") if task in found}
+    if output is not None:
+        with replaced_folder(output, marker=MARKER) as folder:
+            (folder / MARKER).write_text(json.dumps(metrics, indent=2) + "\n")
+            _write_csv(folder / "per_scene.csv", scores.rows("scene"))
+            _write_csv(folder / "per_object.csv", scores.rows("object"))
+    return metrics
+
+
+def metrics_table(metrics: Mapping[str, Any], *, title: str) -> Table:
+    """Return the numbers as a table for the terminal."""
+    table = Table("class", "found", "objects", "accuracy", title=title)
+    accuracy = metrics["scan2cad"]
+    for name, entry in accuracy["per_class"].items():
+        if entry["n_total"]:
+            table.add_row(name, str(entry["n_good"]), str(entry["n_total"]), f"{entry['accuracy']:.1%}")
+    table.add_section()
+    table.add_row("mean of classes", "", "", f"{accuracy['class_average']:.1%}")
+    table.add_row(
+        "all objects", str(accuracy["n_good"]), str(accuracy["n_total"]), f"{accuracy['global_average']:.1%}"
+    )
+    table.add_section()
+    for threshold, entry in metrics["box_f1"]["per_threshold"].items():
+        table.add_row(
+            f"F1 at IoU {threshold}", str(entry["n_matched"]), str(entry["n_true"]), f"{entry['f1']:.3f}"
+        )
+    for task in ("occupancy", "foreground"):
+        if f"{task}_iou" in metrics:
+            table.add_row(f"IoU of {task}", "", "", f"{metrics[f'{task}_iou']:.3f}")
+    return table
+
+
+def _write_csv(path: Path, rows: Sequence[Row]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, fieldnames=list(rows[0]) if rows else ["scene_id"])
+        writer.writeheader()
+        writer.writerows(rows)

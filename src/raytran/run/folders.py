@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The folders of runs: where a new one goes, which one to continue, which finished stage to start from.
+
+A run lives in ``<outputs>/<preset>/<experiment>/<time>``. It holds ``checkpoints/last.ckpt`` while it goes on
+and, once its last step is done, ``finished.json``.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from omegaconf import OmegaConf
+
+from raytran.errors import CheckpointError, ConfigError
+
+LAST = Path("checkpoints") / "last.ckpt"
+FINISHED = "finished.json"
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What ``finished.json`` says.
+
+    Attributes:
+        stage: name of the stage that was trained.
+        preset: the preset.
+        experiment: the experiment.
+        checkpoint: path of the final checkpoint, relative to the run's folder.
+        steps: optimiser steps taken.
+        time: when it finished, UTC, ISO 8601.
+    """
+
+    stage: str
+    preset: str
+    experiment: str
+    checkpoint: str
+    steps: int
+    time: str
+
+
+def write_finished(folder: Path, *, stage: str, preset: str, experiment: str, steps: int) -> Finished:
+    """Mark the run in ``folder`` as finished and return the mark."""
+    now = datetime.now(UTC).isoformat()
+    mark = Finished(stage, preset, experiment, LAST.as_posix(), steps, now)
+    partial = folder / f"{FINISHED}.part"
+    partial.write_text(json.dumps(asdict(mark), indent=2) + "\n")
+    os.replace(partial, folder / FINISHED)
+    return mark
+
+
+def read_finished(folder: Path) -> Finished | None:
+    """Return the mark of the run in ``folder``, None if it has not finished.
+
+    Raises:
+        CheckpointError: the file is damaged.
+    """
+    path = folder / FINISHED
+    if not path.is_file():
+        return None
+    try:
+        return Finished(**json.loads(path.read_text()))
+    except (ValueError, TypeError) as error:
+        raise CheckpointError(
+            f"{path} is damaged: delete it and run that stage again with resume=auto"
+        ) from error
+
+
+def newest_finished(outputs: Path, *, preset: str, stage: str) -> Path | None:
+    """Return the checkpoint of the newest finished run of ``stage`` with ``preset``, None if there is none."""
+    found = []
+    for path in (outputs / preset).glob(f"**/{FINISHED}"):
+        mark = read_finished(path.parent)
+        if mark is not None and (mark.stage, mark.preset) == (stage, preset):
+            checkpoint = path.parent / mark.checkpoint
+            if checkpoint.is_file():
+                found.append((mark.time, checkpoint))
+    return max(found)[1] if found else None
+
+
+def newest_unfinished(parent: Path, holds: Path) -> Path | None:
+    """Return the newest folder in ``parent`` that has the file ``holds`` but no ``finished.json``."""
+    if not parent.is_dir():
+        return None
+    found = [
+        folder
+        for folder in parent.iterdir()
+        if (folder / holds).is_file() and not (folder / FINISHED).exists()
+    ]
+    return max(found, key=lambda folder: (folder / holds).stat().st_mtime, default=None)
+
+
+def run_folder(outputs: str, preset: str, experiment: str, resume: str, holds: str = LAST.as_posix()) -> str:
+    """Return the folder for a run: that of the run to continue, or a new one named by the time.
+
+    Args:
+        outputs: top folder of all runs.
+        preset: the preset.
+        experiment: the experiment.
+        resume: ``none``, ``auto``, or a checkpoint inside the folder of the run to continue.
+        holds: the file that tells a folder worth continuing.
+
+    Raises:
+        ConfigError: ``resume`` names a file that is not the checkpoint of a run.
+    """
+    parent = Path(outputs) / preset / experiment
+    if resume == "auto":
+        unfinished = newest_unfinished(parent, Path(holds))
+        if unfinished is not None:
+            return str(unfinished)
+    elif resume != "none":
+        checkpoint = Path(resume)
+        if checkpoint.parent.name != LAST.parent.name:
+            raise ConfigError(
+                f"resume={resume} is not inside the folder of a run (…/checkpoints/last.ckpt): "
+                "give resume=auto, or init_from=CHECKPOINT to start a new run from its weights"
+            )
+        return str(checkpoint.parent.parent)
+    return str(parent / datetime.now().strftime("%Y-%m-%d_%H-%M-%S"))
+
+
+def register_resolvers() -> None:
+    """Make ``${run_folder:…}`` known to the configs; evaluated once per command."""
+    OmegaConf.register_new_resolver("run_folder", run_folder, use_cache=True, replace=True)

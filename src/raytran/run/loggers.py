@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loggers that need more than a constructor call, and reading back what the CSV logger wrote."""
+
+from __future__ import annotations
+
+import csv
+import logging
+from pathlib import Path
+from typing import Any
+
+from raytran.errors import ConfigError
+
+_log = logging.getLogger(__name__)
+
+LOGS = "logs"
+
+
+def wandb_logger(*, project: str, name: str, save_dir: str) -> Any:
+    """Return a logger to Weights & Biases, offline where the machine has no key."""
+    import wandb
+    from lightning.pytorch.loggers import WandbLogger
+
+    offline = not wandb.api.api_key
+    if offline:
+        _log.info("no W&B key found: logging offline in %s (send it later with `wandb sync`)", save_dir)
+    Path(save_dir).mkdir(parents=True, exist_ok=True)
+    return WandbLogger(project=project, name=name, save_dir=save_dir, offline=offline)
+
+
+def tensorboard_logger(*, save_dir: str, name: str) -> Any:
+    """Return a logger for TensorBoard.
+
+    Raises:
+        ConfigError: the package is not installed.
+    """
+    from lightning.pytorch.loggers import TensorBoardLogger
+
+    try:
+        return TensorBoardLogger(save_dir=save_dir, name=name)
+    except ModuleNotFoundError as error:
+        raise ConfigError("logger=tensorboard needs a package: pip install 'raytran[tensorboard]'") from error
+
+
+def read_history(folder: Path) -> dict[str, list[tuple[int, float]]]:
+    """Return what a run logged: name → (step, value) pairs by rising step.
+
+    A resumed run writes a new table and may repeat the steps after its last checkpoint; the newest value of
+    a step counts.
+
+    Args:
+        folder: of the run.
+    """
+    tables = (folder / LOGS).glob("version_*/metrics.csv")
+    history: dict[str, dict[int, float]] = {}
+    for table in sorted(tables, key=lambda path: int(path.parent.name.removeprefix("version_"))):
+        with table.open(newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                for name, value in row.items():
+                    if name not in ("step", "epoch") and value:
+                        history.setdefault(name, {})[int(row["step"])] = float(value)
+    return {name: sorted(values.items()) for name, values in history.items()}

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a result comes from: commit, versions, machine."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import raytran
+
+_PACKAGES = (
+    "torch",
+    "lightning",
+    "hydra-core",
+    "torchmetrics",
+    "numpy",
+    "trimesh",
+    "scikit-image",
+    "embreex",
+)
+
+
+def git_commit(package: Path | None = None) -> str | None:
+    """Return the commit of the clone that the package runs from, with ``+changes`` if files differ from it.
+
+    None for an installed wheel, even one that was installed inside somebody else's repository.
+    """
+    package = package or Path(raytran.__file__).resolve().parent
+    top = _git(package, "rev-parse", "--show-toplevel")
+    if top is None or Path(top).resolve() / "src" / "raytran" != package:
+        return None
+    commit = _git(package, "rev-parse", "HEAD")
+    changed = _git(package, "status", "--porcelain", "--untracked-files=no")
+    return f"{commit}+changes" if commit and changed else commit
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python, of this package and of those that its numbers depend on."""
+    found = {"python": platform.python_version(), "raytran": raytran.__version__}
+    for name in _PACKAGES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found
+
+
+def provenance() -> dict[str, Any]:
+    """Return commit, versions and platform as plain Python."""
+    return {"git_commit": git_commit(), "versions": versions(), "platform": platform.platform()}
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(folder), *arguments], capture_output=True, text=True, check=True
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return done.stdout.strip()

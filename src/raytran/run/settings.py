@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The switches that people type, with their types."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from raytran.errors import ConfigError
+
+PROGRESS_BARS = ("rich", "tqdm", "none")
+
+
+@dataclass
+class RunConfig:
+    """Top level of ``conf/train.yaml``, checked before anything is built.
+
+    Attributes:
+        preset: name of the preset, part of the run's folder.
+        experiment: name of the experiment, part of the run's folder.
+        seed: of weights, order and frames.
+        outputs: top folder of all runs, searched by ``init_from=auto``.
+        output_dir: folder of this run.
+        init_from: ``auto``, ``none``, or a checkpoint whose weights to start from.
+        resume: ``none``, ``auto``, or the checkpoint of an interrupted run to continue.
+        checkpoint_every: optimiser steps between two writings of the last checkpoint.
+        progress_bar: ``rich``, ``tqdm`` or ``none``.
+    """
+
+    preset: str
+    experiment: str
+    seed: int
+    outputs: str
+    output_dir: str
+    init_from: str
+    resume: str
+    checkpoint_every: int
+    progress_bar: str
+
+    @staticmethod
+    def read(cfg: DictConfig) -> RunConfig:
+        """Return the checked switches of a composed config.
+
+        Raises:
+            ConfigError: a switch has a value of the wrong type or none that exists.
+        """
+        values = {field.name: cfg[field.name] for field in fields(RunConfig)}
+        try:
+            typed = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(RunConfig), values))
+        except OmegaConfBaseException as error:
+            raise ConfigError(str(error).splitlines()[0]) from error
+        if not isinstance(typed, RunConfig):
+            raise ConfigError(f"expected the settings of a run, got {type(typed).__name__}")
+        if typed.progress_bar not in PROGRESS_BARS:
+            raise ConfigError(
+                f"unknown progress_bar={typed.progress_bar}: choose one of {', '.join(PROGRESS_BARS)}"
+            )
+        if typed.checkpoint_every < 1:
+            raise ConfigError(f"checkpoint_every must be at least 1, got {typed.checkpoint_every}")
+        return typed

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Progress of a fit in optimiser steps: stages are counted in steps, and an epoch may be a handful of rooms."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import lightning.pytorch as pl
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+_log = logging.getLogger(__name__)
+
+_LINES = 10
+"""Lines per fit where there is no terminal to draw a bar on."""
+
+
+class StepProgress(pl.Callback):
+    """A rich bar on a terminal, ten lines in a log file.
+
+    Args:
+        title: what to write before the bar.
+    """
+
+    def __init__(self, title: str) -> None:
+        self._title = title
+        self._bar: Progress | None = None
+        self._task: Any = None
+        self._shown_at = 0
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Draw the bar."""
+        self._shown_at = trainer.global_step
+        if not trainer.is_global_zero or not Console().is_terminal:
+            return
+        columns = (
+            TimeElapsedColumn(),
+            TextColumn("left"),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[loss]}"),
+        )
+        self._bar = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *columns)
+        self._task = self._bar.add_task(
+            self._title, total=_total(trainer), completed=trainer.global_step, loss=""
+        )
+        self._bar.start()
+
+    def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *_: Any) -> None:
+        """Move on."""
+        if self._bar is not None:
+            self._bar.update(self._task, completed=trainer.global_step, loss=_loss(trainer))
+        elif trainer.is_global_zero and trainer.global_step - self._shown_at >= max(
+            1, trainer.max_steps // _LINES
+        ):
+            self._shown_at = trainer.global_step
+            _log.info(
+                "%s: step %d of %s, %s", self._title, trainer.global_step, _total(trainer), _loss(trainer)
+            )
+
+    def teardown(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
+        """Leave the finished bar on the screen."""
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+
+def _total(trainer: pl.Trainer) -> int | None:
+    return trainer.max_steps if trainer.max_steps > 0 else None
+
+
+def _loss(trainer: pl.Trainer) -> str:
+    loss = trainer.progress_bar_metrics.get("train/total")
+    return "" if loss is None else f"loss {loss:.4g}"

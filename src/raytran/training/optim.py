@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The optimiser and its learning-rate schedule."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+from torch import nn
+from torch.optim import AdamW
+from torch.optim.lr_scheduler import LambdaLR
+
+
+def learning_rate_factor(step: int, *, total_steps: int, warmup_steps: int, decay: str) -> float:
+    """Return what the learning rate is multiplied with before step ``step`` (counted from 0).
+
+    Rises linearly over ``warmup_steps``; then stays 1 (``decay="none"``) or falls to 0 at ``total_steps`` along
+    a half cosine (``decay="cosine"``).
+    """
+    if step < warmup_steps:
+        return (step + 1) / warmup_steps
+    if decay == "none":
+        return 1.0
+    progress = min(1.0, (step - warmup_steps) / max(1, total_steps - warmup_steps))
+    return 0.5 * (1.0 + math.cos(math.pi * progress))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Optimization:
+    """AdamW with the paper's values (RayTran §4); the paper names no warm-up and no decay.
+
+    Attributes:
+        learning_rate: peak learning rate.
+        weight_decay: decoupled weight decay, on all parameters.
+        warmup_steps: optimiser steps of linear rise.
+        decay: ``none`` or ``cosine``.
+    """
+
+    learning_rate: float = 1e-4
+    weight_decay: float = 5e-2
+    warmup_steps: int = 0
+    decay: Literal["none", "cosine"] = "none"
+
+    def build(self, parameters: Iterable[nn.Parameter], total_steps: int) -> dict[str, Any]:
+        """Return optimiser and schedule for the parameters that train, as Lightning expects them."""
+        trained = [parameter for parameter in parameters if parameter.requires_grad]
+        optimizer = AdamW(trained, lr=self.learning_rate, weight_decay=self.weight_decay)
+        factor = partial(
+            learning_rate_factor, total_steps=total_steps, warmup_steps=self.warmup_steps, decay=self.decay
+        )
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": LambdaLR(optimizer, factor), "interval": "step"},
+        }

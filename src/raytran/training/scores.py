@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The metrics that apply to what a model was asked for, updated and computed together."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from functools import partial
+from typing import Any, Literal
+
+from torch import nn
+from torchmetrics import Metric
+
+from raytran.metrics.odam import OrientedBoxF1
+from raytran.metrics.records import Row
+from raytran.metrics.scan2cad import Scan2CADAccuracy
+from raytran.metrics.scene import ForegroundIoU, SceneOccupancyIoU
+from raytran.postprocess import select_objects
+from raytran.types import SceneBatch, ScenePrediction
+
+SCORE_THRESHOLD = 0.5
+DUPLICATE_IOU = 0.25
+
+
+class SceneScores(nn.Module):
+    """Alignment accuracy and box F1 of objects, IoU of occupancy and foreground, over all scenes seen.
+
+    Args:
+        tasks: what the model predicts: some of ``objects``, ``occupancy``, ``foreground``.
+        score_threshold: objects with a lower score do not count as predicted.
+        duplicate_iou: nor does one that overlaps a surer one of its class by more than this IoU.
+    """
+
+    def __init__(
+        self,
+        *,
+        tasks: Collection[str],
+        score_threshold: float = SCORE_THRESHOLD,
+        duplicate_iou: float | None = DUPLICATE_IOU,
+    ) -> None:
+        super().__init__()
+        self._select = partial(select_objects, score_threshold=score_threshold, duplicate_iou=duplicate_iou)
+        self.accuracy = Scan2CADAccuracy(protocol="strict") if "objects" in tasks else None
+        self.box_f1 = OrientedBoxF1(protocol="strict") if "objects" in tasks else None
+        self.occupancy = SceneOccupancyIoU() if "occupancy" in tasks else None
+        self.foreground = ForegroundIoU() if "foreground" in tasks else None
+
+    def update(self, batch: SceneBatch, predictions: Sequence[ScenePrediction]) -> None:
+        """Add scenes; a metric whose targets the batch lacks is left as it is."""
+        if self.accuracy is not None and self.box_f1 is not None and batch.objects is not None:
+            kept = [self._select(prediction).objects for prediction in predictions]
+            self.accuracy.update(kept, batch.objects, batch.scene_id)
+            self.box_f1.update(kept, batch.objects, batch.scene_id)
+        for index, prediction in enumerate(predictions):
+            if (
+                self.occupancy is not None
+                and batch.occupancy is not None
+                and prediction.occupancy is not None
+            ):
+                self.occupancy.update(prediction.occupancy, batch.occupancy[index])
+            if (
+                self.foreground is not None
+                and batch.foreground is not None
+                and prediction.foreground is not None
+            ):
+                self.foreground.update(prediction.foreground, batch.foreground[index])
+
+    def results(self) -> dict[str, Any]:
+        """Return everything the metrics say, by metric, as plain Python."""
+        return {
+            name: _plain(metric.compute()) for name, metric in self._metrics().items() if metric.update_called
+        }
+
+    def compute(self) -> dict[str, float]:
+        """Return the numbers to watch during training, by ``task/number``."""
+        found = self.results()
+        numbers: dict[str, float] = {}
+        if "accuracy" in found:
+            numbers["objects/accuracy_global"] = found["accuracy"]["global_average"]
+            numbers["objects/accuracy_class"] = found["accuracy"]["class_average"]
+        for threshold, values in found.get("box_f1", {}).get("per_threshold", {}).items():
+            numbers[f"objects/f1_{threshold}"] = values["f1"]
+        for task in ("occupancy", "foreground"):
+            if task in found:
+                numbers[f"{task}/iou"] = found[task]
+        return numbers
+
+    def rows(self, per: Literal["scene", "object"]) -> list[Row]:
+        """Return a row per scene or true object, the columns of both object metrics side by side."""
+        if self.accuracy is None or self.box_f1 is None:
+            return []
+        pairs = zip(self.accuracy.rows(per), self.box_f1.rows(per), strict=True)
+        return [accuracy | box_f1 for accuracy, box_f1 in pairs]
+
+    def reset(self) -> None:
+        """Forget all scenes."""
+        for metric in self._metrics().values():
+            metric.reset()
+
+    def _metrics(self) -> dict[str, Metric]:
+        return {name: metric for name, metric in self.named_children() if isinstance(metric, Metric)}
+
+
+def _plain(value: Any) -> Any:
+    """Return ``value`` with tensors turned into numbers."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    return value.item() if hasattr(value, "item") else value
