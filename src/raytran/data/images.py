@@ -81,33 +81,43 @@ def read_images(
     Raises:
         DataError: fewer than ``min_views`` different images can be read.
     """
-    read: dict[int, Tensor] = {}
-    failed: dict[int, DataError] = {}
-
-    def can_read(position: int) -> bool:
-        if position not in read and position not in failed:
-            try:
-                read[position] = read_image(paths[position], image_size, stored=stored)
-            except DataError as error:
-                failed[position] = error
-        return position in read
-
-    good = [position for position in chosen if can_read(position)]
-    for position in (position for position in chosen if position in failed):
+    reader = _Reader(paths, image_size, stored)
+    good = [position for position in chosen if reader.can_read(position)]
+    for position in [position for position in chosen if position in reader.failed]:
         near_to_far = np.argsort(np.abs(np.arange(len(paths)) - position), kind="stable").tolist()
-        fresh = (other for other in near_to_far if other not in good and can_read(other))
+        fresh = (other for other in near_to_far if other not in good and reader.can_read(other))
         again = (other for other in near_to_far if other in good)
         good.extend(other for other in [next(fresh, next(again, -1))] if other >= 0)
-    if failed:
-        first = next(iter(failed.values()))
-        _warn_once(f"skipped {len(failed)} unreadable images of {paths[0].parent.parent}: {first}")
+    if reader.failed:
+        first = next(iter(reader.failed.values()))
+        _warn_once(f"skipped {len(reader.failed)} unreadable images of {paths[0].parent.parent}: {first}")
     if len(set(good)) < min(min_views, len(chosen)):
         raise DataError(
             f"only {len(set(good))} of {len(paths)} usable frames in {paths[0].parent} can be read and "
             f"{min_views} are needed: copy or export them again"
         )
     used = sorted(good)
-    return torch.stack([read[position] for position in used]), used
+    return torch.stack([reader.images[position] for position in used]), used
+
+
+class _Reader:
+    """Reads each image of a scan at most once and remembers those that cannot be read."""
+
+    def __init__(self, paths: Sequence[Path], image_size: tuple[int, int], stored: tuple[int, int]) -> None:
+        self.images: dict[int, Tensor] = {}
+        self.failed: dict[int, DataError] = {}
+        self._paths, self._image_size, self._stored = paths, image_size, stored
+
+    def can_read(self, position: int) -> bool:
+        """Read the image at ``position``, if that was not tried before, and return whether it is there."""
+        if position not in self.images and position not in self.failed:
+            try:
+                self.images[position] = read_image(
+                    self._paths[position], self._image_size, stored=self._stored
+                )
+            except DataError as error:
+                self.failed[position] = error
+        return position in self.images
 
 
 def stored_size(paths: Sequence[Path]) -> tuple[int, int]:
