@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Box IoU against exact rational arithmetic, over the kinds of pairs on which other implementations fail.
 
-The oracle is Lasserre's formula for the volume of {x : Ax ≤ b}, a recursion over half-spaces in whole numbers:
-it knows neither corners nor clipping.
+The oracle is Lasserre's formula for the volume of {x : Ax ≤ b}, a recursion over half-spaces in whole
+numbers: it knows neither corners nor clipping.
 """
 
 from __future__ import annotations
@@ -166,9 +166,19 @@ def make_pair(kind: str, rng: np.random.Generator) -> tuple[Box, Box]:
 
 
 KINDS = (
-    "generic detection yaw_only axis_aligned contained identical touch_face touch_edge touch_corner disjoint_near "
-    "coplanar tiny_1cm tiny_1cm_near thin_plate large_offset perm_90 near_parallel small_tilt needle zero_size mirrored"
-).split()
+    *(
+        "generic",
+        "detection",
+        "yaw_only",
+        "axis_aligned",
+        "contained",
+        "identical",
+        "disjoint_near",
+        "coplanar",
+    ),
+    *("touch_face", "touch_edge", "touch_corner", "tiny_1cm", "tiny_1cm_near", "thin_plate", "large_offset"),
+    *("perm_90", "near_parallel", "small_tilt", "needle", "zero_size", "mirrored"),
+)
 
 
 def make_pairs(kind: str, count: int = PAIRS) -> list[tuple[Box, Box]]:

@@ -117,28 +117,29 @@ def _frames(first: OrientedBoxes, second: OrientedBoxes, dtype: torch.dtype) -> 
     center = torch.cat([first.center, second.center]).to(dtype)
     size = torch.cat([first.size, second.size]).to(dtype)
     rotation = torch.cat([first.rotation, second.rotation]).to(dtype)
-    center, matrix = center.T, (rotation * (size / 2)[:, None, :]).permute(1, 2, 0)
-    inverse, determinant = _invert(matrix)
-    finite = torch.cat([center, inverse.flatten(0, 1), determinant[None]]).isfinite().all(dim=0)
+    matrix, inverse, determinant = _affine(size, rotation)
+    finite = torch.cat([center.T, inverse.flatten(0, 1), determinant[None]]).isfinite().all(dim=0)
     solid = finite & (determinant != 0)
     if not solid.all():
-        cube = torch.eye(3, dtype=dtype, device=center.device)[:, :, None]
-        center, matrix = torch.where(solid, center, 0.0), torch.where(solid, matrix, cube)
-        inverse, determinant = _invert(matrix)
-    both = _Frames(center, matrix, inverse, determinant.abs(), solid)
+        # Replaced before any arithmetic: a gradient of 0 times infinity would be NaN.
+        keep, cube = solid[:, None], torch.eye(3, dtype=dtype, device=center.device)
+        center, size = torch.where(keep, center, 0.0), torch.where(keep, size, 1.0)
+        matrix, inverse, determinant = _affine(size, torch.where(keep[:, None], rotation, cube))
+    both = _Frames(center.T, matrix, inverse, determinant.abs(), solid)
     count = first.center.shape[0]
     return _Frames(*(value[..., :count] for value in both)), _Frames(*(value[..., count:] for value in both))
 
 
-def _invert(matrix: Tensor) -> tuple[Tensor, Tensor]:
-    """Return inverse and determinant of ``(3, 3, n)`` by cross products.
+def _affine(size: Tensor, rotation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return ``rotation · diag(size / 2)``, ``(3, 3, n)``, its inverse by cross products and determinant.
 
     The true inverse and not the transpose, so that rotations rounded to float32 are taken as they are.
     """
+    matrix = (rotation * (size / 2)[:, None, :]).permute(1, 2, 0)
     x, y, z = matrix.unbind(dim=1)
     rows = [torch.linalg.cross(first, second, dim=0) for first, second in ((y, z), (z, x), (x, y))]
     determinant = (x * rows[0]).sum(dim=0)
-    return torch.stack(rows) / determinant, determinant
+    return matrix, torch.stack(rows) / determinant, determinant
 
 
 def _near_pairs(a: _Frames, b: _Frames) -> tuple[Tensor, Tensor]:
