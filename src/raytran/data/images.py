@@ -15,7 +15,7 @@ from torch import Tensor
 
 from raytran.errors import DataError
 
-_LOG = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 MIN_VIEWS = 2
 """Fewest different frames from which a scene is reconstructed."""
@@ -137,4 +137,4 @@ def stored_size(paths: Sequence[Path]) -> tuple[int, int]:
 
 @cache
 def _warn_once(message: str) -> None:
-    _LOG.warning(message)
+    _log.warning(message)

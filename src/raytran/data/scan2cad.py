@@ -17,7 +17,7 @@ from raytran.errors import DataError
 from raytran.geometry.rotation import matrix_from_quaternion
 from raytran.types import CLASSES, SYMMETRY_INFINITE, ObjectSet
 
-_LOG = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 CLASS_BY_CATID: dict[str, str] = {
     "02808440": "bathtub",
@@ -112,7 +112,7 @@ def scene_objects(annotation: SceneAnnotation) -> ObjectSet:
     scale = pose[:, :3, :3].norm(dim=1)
     keep = (scale >= _SMALLEST_SCALE).all(dim=1)
     if not keep.all():
-        _LOG.warning("%s: skipped %d models with a degenerate scale", annotation.scene_id, int((~keep).sum()))
+        _log.warning("%s: skipped %d models with a degenerate scale", annotation.scene_id, int((~keep).sum()))
     classes = [CLASS_BY_CATID.get(name.split("/")[0], "other") for name in annotation.model_id]
     center = pose[:, :3, :3] @ annotation.box_center[..., None] + pose[:, :3, 3:]
     return ObjectSet(

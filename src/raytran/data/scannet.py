@@ -20,7 +20,7 @@ from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
 from raytran.types import Views
 
-_LOG = logging.getLogger(__name__)
+_log = logging.getLogger(__name__)
 
 _OFF_CENTRE = 0.15
 """Largest distance of the principal point from the image centre, in widths or heights."""
@@ -87,7 +87,7 @@ def read_scan(folder: Path) -> Scan:
             "check that pose/<n>.txt holds finite 4x4 camera-to-world matrices named as color/<n>.jpg"
         )
     if dropped:
-        _LOG.info("%s: dropped %d of %d frames", folder.name, len(dropped), len(dropped) + len(poses))
+        _log.info("%s: dropped %d of %d frames", folder.name, len(dropped), len(dropped) + len(poses))
     header = _read_header(folder / f"{folder.name}.txt")
     image_size = stored_size([images[name] for name in poses])
     return Scan(
