@@ -74,7 +74,7 @@ class RayTran(nn.Module):
         feature_size = (views.image_size[0] // STRIDE, views.image_size[1] // STRIDE)
         pairs = trace_pairs(cameras, grid, feature_size, self.rays_per_cell)
         with_pixels = "foreground" in tasks
-        voxels, pixels = self.backbone(views.images, pairs, self.grid_resolution, with_pixels=with_pixels)
+        voxels, pixels = self.backbone(views.images, cameras, grid, pairs, with_pixels=with_pixels)
         return RawScene(
             grid_center=center,
             occupancy=self.heads["occupancy"](voxels) if "occupancy" in tasks else None,

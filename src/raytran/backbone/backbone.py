@@ -3,12 +3,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
 from raytran.backbone.block import RayTracedBlock
 from raytran.backbone.resnet import ResNet18
 from raytran.errors import ConfigError, ShapeError, check_shape
+from raytran.geometry.camera import Cameras
+from raytran.geometry.grid import VoxelGrid
+from raytran.geometry.position import position_code
 from raytran.ops.pairs import PairList
 from raytran.ops.splat import splat_features
 
@@ -51,6 +56,8 @@ class Backbone(nn.Module):
         self.channels = channels
         self.resnet = resnet
         self.projection = nn.Linear(resnet.out_channels, channels)
+        self.voxel_position = nn.Linear(channels, channels)
+        self.ray_position = nn.Sequential(nn.Linear(6, channels), nn.GELU(), nn.Linear(channels, channels))
         self.unseen = nn.Parameter(0.02 * torch.randn(channels))
         self.blocks = nn.ModuleList(
             RayTracedBlock(channels=channels, num_heads=num_heads, expansion=expansion)
@@ -64,14 +71,15 @@ class Backbone(nn.Module):
         self.register_buffer("image_std", torch.tensor(scale[: resnet.input_channels]), persistent=False)
 
     def forward(
-        self, images: Tensor, pairs: PairList, resolution: tuple[int, int, int], *, with_pixels: bool = True
+        self, images: Tensor, cameras: Cameras, grid: VoxelGrid, pairs: PairList, *, with_pixels: bool = True
     ) -> tuple[Tensor, Tensor | None]:
         """Return features of the scene and of its views.
 
         Args:
             images: ``(B, N, 3 or 4, H, W)`` uint8, or floating point in [0, 1].
+            cameras: of leading shape ``(B, N)``.
+            grid: the voxel grids, ``center`` ``(B, 3)``.
             pairs: the pixel-voxel pairs of all B scenes, for feature maps of ``H/16 × W/16``.
-            resolution: ``(X, Y, Z)``.
             with_pixels: False leaves out the last block's 3D→2D stream, which only pixel features need.
 
         Returns:
@@ -86,9 +94,10 @@ class Backbone(nn.Module):
                 f"expected images with sides divisible by {STRIDE}, got {tuple(images.shape[-2:])}"
             )
         pixels = self._embed(images.flatten(0, 1))
+        pixels = pixels + self._locate_rays(cameras, grid, pixels.shape[1:3])
         splatted, seen = splat_features(pixels.flatten(0, 2), pairs)
         voxels = torch.where(seen[:, None], splatted, self.unseen.to(splatted.dtype))
-        voxels = voxels.view(images.shape[0], *resolution, self.channels)
+        voxels = voxels.view(images.shape[0], *grid.resolution, self.channels) + self._locate_voxels(grid)
         for index, block in enumerate(self.blocks):
             update_pixels = with_pixels or index + 1 < len(self.blocks)
             voxels, pixels = block(voxels, pixels, pairs, update_pixels=update_pixels)
@@ -99,6 +108,19 @@ class Backbone(nn.Module):
     def idle_without_pixels(self) -> tuple[str, ...]:
         """Return the names of the sub-modules that ``forward(..., with_pixels=False)`` does not reach."""
         return (f"blocks.{len(self.blocks) - 1}.pixel_stream", "pixel_norm")
+
+    def _locate_voxels(self, grid: VoxelGrid) -> Tensor:
+        """Return the position embedding of the voxels, ``(X, Y, Z, C)``; that of every scene is the same."""
+        at_origin = VoxelGrid(grid.resolution, grid.extent, torch.zeros_like(self.image_mean[:3]))
+        return self.voxel_position(position_code(at_origin.voxel_centers(), grid.extent, self.channels))
+
+    def _locate_rays(self, cameras: Cameras, grid: VoxelGrid, size: Sequence[int]) -> Tensor:
+        """Return the embedding ``(n, h, w, C)`` of each cell's centre ray: origin and direction in the grid."""
+        origin, direction = cameras.cell_rays((size[0], size[1]))
+        origin = origin[..., 0, :] - grid.center[:, None, None, None]
+        direction = torch.nn.functional.normalize(direction[..., 0, :], dim=-1)
+        ray = torch.cat([origin.expand_as(direction), direction], dim=-1).flatten(0, 1)
+        return self.ray_position(ray)
 
     def _embed(self, images: Tensor) -> Tensor:
         """Map ``(n, c, H, W)`` to pixel features P⁰, ``(n, h, w, C)``."""

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from torch.quasirandom import SobolEngine
 
 from raytran.geometry.grid import VoxelGrid
+from raytran.geometry.position import position_code
 from raytran.heads.decoder import DecoderLayer
-from raytran.heads.position import PositionEmbedding
 from raytran.types import CLASSES, RawObjects
 
 TYPICAL_SIZE = 0.7
@@ -54,7 +54,7 @@ class ObjectHead(nn.Module):
         self.register_buffer("extent", extent, persistent=False)
         self.reference = nn.Parameter(0.8 * spread)
         self.query = nn.Parameter(torch.randn(num_queries, channels))
-        self.position = PositionEmbedding(channels=channels, extent=grid_extent)
+        self.position = nn.Linear(channels, channels)
         self.layers = nn.ModuleList(
             DecoderLayer(channels=channels, num_heads=num_heads, hidden=hidden) for _ in range(num_layers)
         )
@@ -71,16 +71,20 @@ class ObjectHead(nn.Module):
         grid_center = grid.center.to(self.extent.dtype)
         at_origin = VoxelGrid(grid.resolution, grid.extent, torch.zeros_like(self.extent))
         voxel_position = at_origin.voxel_centers().flatten(0, 2)
-        memory = voxels.flatten(1, 3) + self.position(voxel_position)
+        memory = voxels.flatten(1, 3) + self._locate(voxel_position)
         queries = self.query.expand(scenes, -1, -1)
         reference = (self.reference * self.extent).expand(scenes, -1, -1)
         outputs = []
         for layer, predictor in zip(self.layers, self.predictors, strict=True):
-            queries = layer(queries, self.position(reference), reference, memory, voxel_position)
+            queries = layer(queries, self._locate(reference), reference, memory, voxel_position)
             objects = predictor(queries, reference, grid_center)
             reference = objects.center.detach() - grid_center[:, None]
             outputs.append(objects)
         return tuple(outputs)
+
+    def _locate(self, points: Tensor) -> Tensor:
+        """Return the code ``(..., C)`` of points ``(..., 3)``, metres from the centre of the volume."""
+        return self.position(position_code(points, self.extent.tolist(), self.position.in_features))
 
 
 class ObjectPredictor(nn.Module):

@@ -1,0 +1,26 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import math
+
+import torch
+
+from raytran.geometry.position import position_code
+
+
+def test_lowest_wave_spans_twice_the_volume_and_highest_a_sixteenth() -> None:
+    """Steps along y only; with 24 channels each axis has four sines, then four cosines."""
+    points = torch.tensor([[0.0, 0.0, 0.0], [0.0, 4.5, 0.0], [0.0, 9 / 64, 0.0]])
+    code = position_code(points, (9.0, 9.0, 3.5), 24)
+    of_y = code[:, 8:16]
+    assert code.shape == (3, 24)
+    # A quarter of the wave of 18 m, and a quarter of that of 9/16 m.
+    assert math.isclose(float(of_y[1, 0]), 1.0, abs_tol=1e-6)
+    assert math.isclose(float(of_y[2, 3]), 1.0, abs_tol=1e-6)
+    torch.testing.assert_close(code[1, :8], code[0, :8])
+
+
+def test_any_number_of_channels() -> None:
+    code = position_code(torch.randn(2, 5, 3), (1.0, 1.0, 1.0), 64)
+    assert code.shape == (2, 5, 64)
+    assert not code[..., 60:].any()

@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import torch
+
+from raytran.geometry.grid import VoxelGrid
+from raytran.heads.objects import ObjectHead
+
+EXTENT = (4.0, 4.0, 2.0)
+
+
+def small_head(**changes: int) -> ObjectHead:
+    torch.manual_seed(0)
+    sizes = {"channels": 24, "num_heads": 2, "num_layers": 2, "num_queries": 6, "hidden": 24, **changes}
+    return ObjectHead(**sizes, grid_extent=EXTENT)
+
+
+def grid_at(*centers: list[float]) -> VoxelGrid:
+    return VoxelGrid((4, 4, 2), EXTENT, torch.tensor(centers))
+
+
+def test_shapes_of_every_layer() -> None:
+    outputs = small_head()(torch.randn(2, 4, 4, 2, 24), grid_at([0.0, 0, 0], [1.0, 2, 3]))
+    assert len(outputs) == 2
+    for objects in outputs:
+        assert objects.class_logits.shape == (2, 6, 10)
+        assert objects.center.shape == objects.log_size.shape == (2, 6, 3)
+        assert objects.yaw_vector.shape == (2, 6, 2)
+        assert objects.embedding.shape == (2, 6, 24)
+
+
+def test_centers_move_with_the_grid() -> None:
+    head, voxels = small_head(), torch.randn(1, 4, 4, 2, 24)
+    here, there = head(voxels, grid_at([0.0, 0, 0]))[-1], head(voxels, grid_at([10.0, -20, 5]))[-1]
+    torch.testing.assert_close(there.center - here.center, torch.tensor([10.0, -20, 5]).expand(1, 6, 3))
+    torch.testing.assert_close(there.log_size, here.log_size)
+
+
+def test_untrained_objects_lie_in_the_volume_with_common_sizes() -> None:
+    objects = small_head(num_queries=32)(torch.randn(1, 4, 4, 2, 24), grid_at([0.0, 0, 0]))[-1]
+    assert bool((objects.center.abs() < torch.tensor(EXTENT) / 2).all())
+    # One slot in each octant at least: no object is far from every slot.
+    octant = (objects.center[0] > 0).long() @ torch.tensor([4, 2, 1])
+    assert len(octant.unique()) == 8
+    torch.testing.assert_close(objects.log_size.exp(), torch.full((1, 32, 3), 0.7), rtol=0.3, atol=0.0)
+
+
+def test_every_parameter_gets_a_gradient() -> None:
+    head = small_head()
+    outputs = head(torch.randn(1, 4, 4, 2, 24), grid_at([0.0, 0, 0]))
+    fields = ("class_logits", "center", "log_size", "yaw_vector")
+    sum(getattr(objects, name).square().sum() for objects in outputs for name in fields).backward()
+    assert [name for name, p in head.named_parameters() if p.grad is None or not p.grad.any()] == []
+
+
+def test_half_precision_keeps_centers_exact() -> None:
+    """bfloat16 has steps of 16 mm at 4 m; centres must not be rounded to them."""
+    head, voxels, grid = small_head(), torch.randn(1, 4, 4, 2, 24), grid_at([100.0, 0, 0])
+    exact = head(voxels, grid)[-1]
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        half = head(voxels, grid)[-1]
+    assert half.center.dtype == half.class_logits.dtype == torch.float32
+    assert float((half.center - exact.center).detach().abs().max()) < 0.02

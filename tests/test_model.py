@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from raytran.backbone.backbone import Backbone
+from raytran.backbone.resnet import ResNet18
+from raytran.errors import ShapeError
+from raytran.geometry.rotation import yaw_from_rotation
+from raytran.heads.foreground import ForegroundHead
+from raytran.heads.objects import ObjectHead
+from raytran.heads.occupancy import OccupancyHead
+from raytran.heads.shape import ShapeHead
+from raytran.losses.matcher import HungarianMatcher
+from raytran.losses.total import TotalLoss
+from raytran.model import TASKS, RayTran
+from raytran.types import ObjectSet, RawObjects, RawScene, SceneBatch, Views
+
+RESOLUTION, EXTENT, CHANNELS = (6, 6, 4), (6.0, 6.0, 3.0), 16
+WEIGHTS = dict.fromkeys(("occupancy", "foreground", "class", "center", "size", "yaw", "shape"), 1.0)
+
+
+def make_model(input_channels: int = 3) -> RayTran:
+    torch.manual_seed(0)
+    heads = {
+        "occupancy": OccupancyHead(channels=CHANNELS),
+        "foreground": ForegroundHead(channels=CHANNELS, widths=(8, 8, 4)),
+        "objects": ObjectHead(
+            channels=CHANNELS, num_heads=2, num_layers=2, num_queries=5, hidden=16, grid_extent=EXTENT
+        ),
+        "shape": ShapeHead(channels=CHANNELS, widths=(8, 8, 4, 4)),
+    }
+    resnet = ResNet18(width=4, input_channels=input_channels)
+    backbone = Backbone(resnet=resnet, channels=CHANNELS, num_heads=2, num_blocks=2, expansion=1)
+    return RayTran(backbone=backbone, heads=heads, grid_resolution=RESOLUTION, grid_extent=EXTENT)
+
+
+def make_views(scenes: int = 1, views: int = 2, channels: int = 3) -> Views:
+    """Cameras at about (0, ±1, 0) that look along +y."""
+    g = torch.Generator().manual_seed(1)
+    pose = torch.eye(4).repeat(scenes, views, 1, 1)
+    pose[..., :3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    pose[..., :3, 3] = torch.rand(scenes, views, 3, generator=g)
+    intrinsics = torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]).expand(scenes, views, 3, 3)
+    images = torch.randint(0, 256, (scenes, views, channels, 32, 48), generator=g).to(torch.uint8)
+    return Views(images, intrinsics, pose)
+
+
+def make_objects(count: int) -> ObjectSet:
+    return ObjectSet(
+        label=torch.arange(count),
+        center=torch.rand(count, 3),
+        size=torch.rand(count, 3) + 0.2,
+        rotation=torch.eye(3).expand(count, 3, 3),
+        symmetry=torch.ones(count, dtype=torch.long),
+        score=torch.ones(count),
+        shape=torch.rand(count, 63, 63, 63) > 0.5,
+    )
+
+
+def test_shapes() -> None:
+    raw = make_model()(make_views(scenes=2, views=3))
+    assert raw.occupancy.shape == (2, 6, 6, 4)
+    assert raw.foreground.shape == (2, 3, 32, 48)
+    assert len(raw.objects) == 2
+    assert raw.objects[-1].center.shape == (2, 5, 3)
+
+
+def test_only_what_was_asked_for() -> None:
+    raw = make_model()(make_views(), tasks=("occupancy",))
+    assert raw.occupancy is not None
+    assert raw.foreground is None
+    assert raw.objects is None
+
+
+def test_volume_is_centred_on_the_cameras_unless_told() -> None:
+    model, views = make_model().eval(), make_views(scenes=2)
+    by_default = model(views)
+    mean = views.world_from_camera[:, :, :3, 3].mean(dim=1)
+    torch.testing.assert_close(by_default.grid_center, mean)
+    torch.testing.assert_close(model(views, grid_center=mean).occupancy, by_default.occupancy)
+    assert not torch.allclose(model(views, grid_center=mean + 1).occupancy, by_default.occupancy)
+
+
+def test_batched_equals_single() -> None:
+    model, views = make_model().eval(), make_views(scenes=3)
+    together = model(views)
+    for scene in range(3):
+        one = slice(scene, scene + 1)
+        alone = model(Views(views.images[one], views.intrinsics[one], views.world_from_camera[one]))
+        torch.testing.assert_close(together.occupancy[one], alone.occupancy, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(together.foreground[one], alone.foreground, rtol=1e-4, atol=1e-5)
+        for a, b in zip(together.objects, alone.objects, strict=True):
+            torch.testing.assert_close(a.center[one], b.center, rtol=1e-4, atol=1e-5)
+            torch.testing.assert_close(a.class_logits[one], b.class_logits, rtol=1e-4, atol=1e-4)
+
+
+def test_the_world_may_be_moved() -> None:
+    """Cameras moved together move the centres and change nothing else."""
+    model, views = make_model().eval(), make_views()
+    moved = views.world_from_camera.clone()
+    moved[..., :3, 3] += torch.tensor([8.0, -4.0, 2.0])
+    here, there = model(views), model(Views(views.images, views.intrinsics, moved))
+    torch.testing.assert_close(here.occupancy, there.occupancy, rtol=1e-3, atol=1e-4)
+    shift = there.objects[-1].center - here.objects[-1].center
+    torch.testing.assert_close(shift, torch.tensor([8.0, -4.0, 2.0]).expand_as(shift), rtol=1e-3, atol=1e-3)
+
+
+def test_bytes_equal_floats_and_masks_are_a_fourth_channel() -> None:
+    model, views = make_model(input_channels=4).eval(), make_views(channels=4)
+    as_float = Views(views.images / 255, views.intrinsics, views.world_from_camera)
+    torch.testing.assert_close(model(views).occupancy, model(as_float).occupancy)
+    with pytest.raises(ShapeError, match="images"):
+        model(make_views())
+
+
+def test_sides_must_be_divisible_by_16() -> None:
+    views = make_views()
+    with pytest.raises(ShapeError, match="divisible by 16"):
+        make_model()(Views(views.images[..., :30, :], views.intrinsics, views.world_from_camera))
+
+
+@pytest.mark.parametrize(
+    ("trained", "terms"),
+    [
+        (("occupancy",), ("occupancy",)),
+        (TASKS, TASKS),
+        ((*TASKS, "shape"), (*TASKS, "shape")),
+    ],
+)
+def test_every_parameter_in_use_gets_a_gradient_and_no_other(
+    trained: tuple[str, ...], terms: tuple[str, ...]
+) -> None:
+    model, views = make_model(), make_views()
+    raw = model(views, tasks=[name for name in trained if name in TASKS])
+    batch = SceneBatch(
+        ("a",),
+        views,
+        (("0", "1"),),
+        raw.grid_center,
+        objects=(make_objects(3),),
+        occupancy=torch.rand(1, *RESOLUTION) > 0.5,
+        foreground=torch.rand(1, 2, 32, 48) > 0.5,
+    )
+    loss = TotalLoss(weights=WEIGHTS, matcher=HungarianMatcher(weights=WEIGHTS))
+    loss(raw, batch, terms=terms, decode_shapes=model.decode_shapes)["total"].backward()
+    idle = model.idle_modules(trained)
+    for name, parameter in model.named_parameters():
+        expected = not any(name.startswith(prefix) for prefix in idle)
+        assert (parameter.grad is not None and bool(parameter.grad.any())) == expected, name
+
+
+def raw_with(scores: list[float]) -> RawScene:
+    """Slots whose best class is their number, at the given probability; the rest of it is padding."""
+    probability = torch.full((1, len(scores), 10), 1e-9)
+    for slot, score in enumerate(scores):
+        probability[0, slot, slot] = score
+        probability[0, slot, 9] = 1 - score
+    count = len(scores)
+    objects = RawObjects(
+        class_logits=probability.log(),
+        center=torch.arange(3.0 * count).view(1, count, 3),
+        log_size=torch.full((1, count, 3), math.log(2.0)),
+        yaw_vector=torch.tensor([3.0, 0.0]).expand(1, count, 2),
+        embedding=torch.randn(1, count, CHANNELS),
+    )
+    return RawScene(torch.zeros(1, 3), occupancy=torch.zeros(1, 2, 2, 2), objects=(objects,))
+
+
+def test_decode() -> None:
+    (prediction,) = make_model().decode(raw_with([0.2, 0.9, 0.6]), ["scene"], score_threshold=0.5)
+    objects = prediction.objects
+    assert prediction.scene_id == "scene"
+    assert objects.label.tolist() == [1, 2]
+    torch.testing.assert_close(objects.score, torch.tensor([0.9, 0.6]))
+    torch.testing.assert_close(objects.center, torch.tensor([[3.0, 4, 5], [6, 7, 8]]))
+    torch.testing.assert_close(objects.size, torch.full((2, 3), 2.0))
+    torch.testing.assert_close(yaw_from_rotation(objects.rotation), torch.full((2,), math.pi / 2))
+    assert objects.shape.shape == (2, 63, 63, 63)
+    torch.testing.assert_close(prediction.occupancy, torch.full((2, 2, 2), 0.5))
+
+
+def test_decode_of_nothing_and_without_shapes() -> None:
+    model = make_model()
+    (prediction,) = model.decode(raw_with([0.2, 0.1]), ["scene"], score_threshold=0.5)
+    assert len(prediction.objects) == 0
+    assert prediction.objects.shape.shape == (0, 63, 63, 63)
+    (prediction,) = model.decode(raw_with([0.2, 0.1]), ["scene"], with_shapes=False)
+    assert len(prediction.objects) == 2
+    assert prediction.objects.shape is None
+
+
+def test_predict_runs_in_eval_mode_without_gradients() -> None:
+    model = make_model().train()
+    statistics = model.backbone.resnet.bn1.running_mean.clone()
+    prediction = model.predict(make_views(), scene_id="a")
+    assert len(prediction.objects) == 5
+    assert prediction.objects.score.tolist() == sorted(prediction.objects.score.tolist(), reverse=True)
+    assert not prediction.objects.center.requires_grad
+    torch.testing.assert_close(model.backbone.resnet.bn1.running_mean, statistics)
+    assert prediction.foreground.shape == (2, 32, 48)
