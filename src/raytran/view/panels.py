@@ -24,7 +24,7 @@ def draw_frames(path: Path, views: Views, *, count: int = 8, columns: int = 4) -
     """Write a contact sheet of frames of the first scene, spread over the walk, as JPEG."""
     number = views.images.shape[1]
     tiles = [frame_image(views, n) for n in choose_even(number, min(count, number)).tolist()]
-    return _contact_sheet(path, tiles, columns)
+    return contact_sheet(path, tiles, columns)
 
 
 def draw_masks(
@@ -52,7 +52,7 @@ def draw_masks(
             edge[1:] |= inside[1:] != inside[:-1]
             tile[edge] = _OUTLINE
         tiles.append(Image.fromarray(tile))
-    return _contact_sheet(path, tiles, columns)
+    return contact_sheet(path, tiles, columns)
 
 
 def draw_occupancy(
@@ -87,9 +87,10 @@ def draw_occupancy(
     return path
 
 
-def _contact_sheet(
+def contact_sheet(
     path: Path, tiles: Sequence[Image.Image], columns: int, *, width: int = 1280, gap: int = 4
 ) -> Path:
+    """Write pictures of one size side by side in rows, ``width`` pixels across, as JPEG."""
     tile_width = (width - gap * (columns - 1)) // columns
     tile_height = round(tiles[0].height * tile_width / tiles[0].width)
     rows = -(-len(tiles) // columns)

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole path on a few generated rooms: make, train, measure, predict, show."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
+
+from raytran.errors import ConfigError
+from raytran.model import RayTran
+from raytran.run.build import build_data, plain
+from raytran.run.checkpoint import load_model
+from raytran.run.curriculum import run_curriculum
+from raytran.run.demo_page import SPLITS, ShownScene, headline, write_page
+from raytran.run.entry import compose
+from raytran.run.evaluate import evaluate_model
+from raytran.run.predict import predict_scene, write_scene
+from raytran.run.steps import StepTimes
+from raytran.run.train import FitResult
+from raytran.training.datamodule import SceneDataModule
+
+_log = logging.getLogger(__name__)
+
+_RECORD = "demo.json"
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What a demo leaves.
+
+    Attributes:
+        page: the HTML file.
+        metrics: content of ``metrics.json`` of the splits ``train`` and ``val``.
+        seconds: time of each step.
+    """
+
+    page: Path
+    metrics: Mapping[str, Mapping[str, Any]]
+    seconds: Mapping[str, float]
+
+
+def demo(cfg: DictConfig) -> DemoResult:
+    """Run ``python -m raytran.demo``; see ``conf/demo.yaml``.
+
+    Rooms and stages that an earlier run in the same folder finished are kept, an interrupted stage goes on;
+    what follows from them takes seconds and is made anew.
+
+    Raises:
+        ConfigError: the folder holds a demo with other settings.
+    """
+    output = Path(cfg.output).resolve()
+    overrides = [f"preset={cfg.preset}", f"data.root={_quoted(output / 'rooms')}", *plain(cfg.overrides)]
+    data = _data(overrides, output)
+    times = StepTimes(output / "times.json")
+    with times.measure("rooms", continues=True):
+        data.prepare_data()
+    fits = _train(overrides, output / "training", times)
+    model = load_model(fits[-1].checkpoint)
+    with times.measure("evaluation"):
+        metrics = {split: _evaluate(cfg, model, data, split, output, fits[-1]) for split in SPLITS}
+    with times.measure("prediction"):
+        scenes = [_predict_first(cfg, model, data, split, output) for split in SPLITS]
+    with times.measure("page"):
+        page = write_page(output, scenes=scenes, metrics=metrics, fits=fits, seconds=times.seconds)
+    _tell(page, metrics, times.seconds)
+    return DemoResult(page, metrics, times.seconds)
+
+
+def _data(overrides: Sequence[str], output: Path) -> SceneDataModule:
+    """Return the rooms, with all targets that are measured and the views that a prediction takes.
+
+    Raises:
+        ConfigError: ``output`` holds a demo with other settings.
+    """
+    settings = ["experiment=stage2", "data.val_views=${views.predict_views}", f"output_dir={_quoted(output)}"]
+    cfg = compose("train", [*overrides, *settings])
+    # Settings are compared as JSON writes them, in which there are no tuples.
+    wanted = json.loads(json.dumps(plain(cfg)))
+    path = output / _RECORD
+    if path.is_file() and json.loads(path.read_text()) != wanted:
+        raise ConfigError(f"{output} holds a demo with other settings: delete it or choose another output")
+    output.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.part")
+    temporary.write_text(json.dumps(wanted, indent=1) + "\n")
+    os.replace(temporary, path)
+    return build_data(cfg)
+
+
+def _train(overrides: Sequence[str], folder: Path, times: StepTimes) -> list[FitResult]:
+    fits = run_curriculum(overrides, output_dir=folder)
+    for fit in fits:
+        # A stage that had finished before took no time now; its entry is there already.
+        if fit.seconds:
+            times.add(f"training, {fit.folder.name}", fit.seconds)
+    return fits
+
+
+def _evaluate(
+    cfg: DictConfig, model: RayTran, data: SceneDataModule, split: str, output: Path, fit: FitResult
+) -> dict[str, Any]:
+    about = {"checkpoint": str(fit.checkpoint), "data": str(data.root), "split": split}
+    return evaluate_model(
+        model,
+        data.split(split),
+        output=output / "evaluation" / split,
+        score_threshold=cfg.score_threshold,
+        duplicate_iou=cfg.duplicate_iou,
+        about=about,
+    )
+
+
+def _predict_first(
+    cfg: DictConfig, model: RayTran, data: SceneDataModule, split: str, output: Path
+) -> ShownScene:
+    """Predict the first room of a split; write what ``raytran.predict`` writes, the truth in the plan."""
+    batch = data.split(split)[0]
+    found = predict_scene(
+        model,
+        batch.views,
+        scene_id=batch.scene_id[0],
+        score_threshold=cfg.score_threshold,
+        duplicate_iou=cfg.duplicate_iou,
+    )
+    folder = output / "predictions" / batch.scene_id[0]
+    truth = None if batch.objects is None else batch.objects[0]
+    write_scene(folder, found, batch.views, batch.frame_id[0], grid_extent=model.grid_extent, truth=truth)
+    return ShownScene(split, folder, batch, found.prediction, model.grid_extent)
+
+
+def _tell(page: Path, metrics: Mapping[str, Mapping[str, Any]], seconds: Mapping[str, float]) -> None:
+    table = Table("", *SPLITS.values(), title=f"demo, {sum(seconds.values()) / 60:.1f} min")
+    columns = [headline(metrics[split]) for split in SPLITS]
+    for name in columns[0]:
+        table.add_row(name, *(column[name] for column in columns))
+    console = Console()
+    console.print(table)
+    console.print(f"Everything is in {page.parent}")
+    console.print(f"Open {page}", soft_wrap=True)
+
+
+def _quoted(path: Path) -> str:
+    """Return a path as Hydra's override grammar wants it."""
+    escaped = str(path).replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The page of the demo: what its numbers are, what they prove, and pictures of two rooms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from raytran.run.loggers import read_history
+from raytran.run.provenance import provenance
+from raytran.run.train import FitResult
+from raytran.types import SceneBatch, ScenePrediction
+from raytran.view.curves import draw_curves
+from raytran.view.panels import contact_sheet, draw_frames, draw_masks, draw_occupancy
+from raytran.view.report import Picture, Report, Section, SplitScores, write_report
+
+SPLITS = {"train": "training rooms", "val": "held-out rooms"}
+"""Split → what a reader is told it is, in the order of the page."""
+
+_STAGES = {"stage1": "1 · occupancy", "stage2": "2 · all but shape", "stage3": "3 · shape"}
+
+
+@dataclass(frozen=True)
+class ShownScene:
+    """A room to show.
+
+    Attributes:
+        split: ``train`` or ``val``.
+        folder: what ``write_scene`` wrote.
+        batch: input and truth, B = 1.
+        prediction: what was found.
+        grid_extent: sizes of the voxel grid, metres.
+    """
+
+    split: str
+    folder: Path
+    batch: SceneBatch
+    prediction: ScenePrediction
+    grid_extent: tuple[float, float, float]
+
+
+def headline(metrics: Mapping[str, Any]) -> dict[str, str]:
+    """Return the numbers to put first, as text, from the content of a ``metrics.json``."""
+    accuracy = metrics["scan2cad"]
+    numbers = {"accuracy": f"{accuracy['global_average']:.0%}"}
+    numbers["objects"] = f"{accuracy['n_good']} of {accuracy['n_total']}"
+    for threshold, entry in metrics["box_f1"]["per_threshold"].items():
+        numbers[f"F1 at IoU {threshold}"] = f"{entry['f1']:.2f}"
+    for task, name in (("occupancy", "occupancy IoU"), ("foreground", "mask IoU")):
+        if f"{task}_iou" in metrics:
+            numbers[name] = f"{metrics[f'{task}_iou']:.2f}"
+    return numbers
+
+
+def write_page(
+    output: Path,
+    *,
+    scenes: Sequence[ShownScene],
+    metrics: Mapping[str, Mapping[str, Any]],
+    fits: Sequence[FitResult],
+    seconds: Mapping[str, float],
+) -> Path:
+    """Draw the pictures into ``output/pictures`` and write ``output/index.html``.
+
+    Args:
+        output: folder of the demo.
+        scenes: rooms to show.
+        metrics: content of ``metrics.json`` by split.
+        fits: of the stages, in order.
+        seconds: time of each step so far.
+
+    Returns:
+        The page.
+    """
+    pictures = output / "pictures"
+    pictures.mkdir(parents=True, exist_ok=True)
+    histories = {_STAGES.get(fit.folder.name, fit.folder.name): read_history(fit.folder) for fit in fits}
+    curves = draw_curves(pictures / "curves.png", histories)
+    steps = ", ".join(f"{fit.steps:,}" for fit in fits)
+    training = Section(
+        "Training",
+        f"Three fits, one after another, of {steps} steps: first what is occupied, then everything but the "
+        "shapes, then the shapes alone while the rest is frozen.",
+        [
+            Picture(
+                curves, "Terms of the loss against steps: the running mean, and the values behind.", wide=True
+            )
+        ],
+    )
+    report = Report(
+        title="RayTran on generated rooms",
+        summary=_summary(metrics),
+        splits=[_scores(split, metrics) for split in SPLITS],
+        sections=[*(_show(scene, pictures) for scene in scenes), training],
+        steps=seconds,
+        files=_files(output, scenes, fits),
+        versions=_versions(),
+    )
+    return write_report(output / "index.html", report)
+
+
+def _summary(metrics: Mapping[str, Mapping[str, Any]]) -> str:
+    counts = {split: metrics[split]["scan2cad"]["n_scenes"] for split in SPLITS}
+    return (
+        f"Rooms were generated, a small network was trained from scratch on {counts['train']} of them through "
+        "the three stages of the paper, and then asked for the objects of these and of "
+        f"{counts['val']} rooms it has never seen: class, position, size, heading and mesh, from posed colour "
+        "frames alone."
+    )
+
+
+def _scores(split: str, metrics: Mapping[str, Mapping[str, Any]]) -> SplitScores:
+    rooms = metrics["train"]["scan2cad"]["n_scenes"]
+    meaning = {
+        "train": "The network was trained on these very rooms. High numbers prove that the whole chain "
+        "learns, from pixels to boxes and meshes; they say nothing about other rooms.",
+        "val": f"The network has never seen these rooms. {rooms} rooms cannot teach what furniture looks like "
+        "in general, so low numbers are expected; many more rooms and steps are needed to generalise.",
+    }
+    per_class = metrics[split]["scan2cad"]["per_class"]
+    return SplitScores(
+        title=SPLITS[split].capitalize(),
+        meaning=meaning[split],
+        numbers=headline(metrics[split]),
+        per_class={
+            name: (entry["n_good"], entry["n_total"]) for name, entry in per_class.items() if entry["n_total"]
+        },
+    )
+
+
+def _show(scene: ShownScene, pictures: Path) -> Section:
+    batch, prediction = scene.batch, scene.prediction
+    folder = pictures / scene.prediction.scene_id
+    folder.mkdir(exist_ok=True)
+    overlays = [Image.open(path) for path in sorted((scene.folder / "overlays").iterdir())]
+    shown = [
+        Picture(
+            scene.folder / "topdown.png", "From above. Filled: predicted; dashed: true; arrow heads: fronts."
+        ),
+        Picture(
+            contact_sheet(folder / "overlays.jpg", overlays, columns=2),
+            "Predicted boxes and meshes over frames; the front face of a box is drawn bold.",
+        ),
+        Picture(
+            draw_frames(folder / "frames.jpg", batch.views),
+            "Some of the frames the network was given.",
+            wide=True,
+        ),
+    ]
+    if prediction.foreground is not None:
+        truth = None if batch.foreground is None else batch.foreground[0]
+        masks = draw_masks(folder / "masks.jpg", batch.views, prediction.foreground, truth, columns=2)
+        caption = "Where objects are, also where others hide them. Orange: predicted; white line: true."
+        shown.append(Picture(masks, caption))
+    if prediction.occupancy is not None:
+        truth = None if batch.occupancy is None else batch.occupancy[0]
+        height = scene.grid_extent[2]
+        slices = draw_occupancy(folder / "occupancy.png", prediction.occupancy, truth, height=height)
+        shown.append(Picture(slices, "Occupied voxels in four layers; heights count from the mean camera."))
+    count = 0 if batch.objects is None else len(batch.objects[0])
+    found = f"{len(prediction.objects)} objects were predicted, {count} are there."
+    kind = "held-out" if scene.split == "val" else "training"
+    return Section(f"A {kind} room: {prediction.scene_id}", found, shown)
+
+
+def _files(output: Path, scenes: Sequence[ShownScene], fits: Sequence[FitResult]) -> dict[str, Path]:
+    files = {f"3D scene of {s.prediction.scene_id} (glTF)": s.folder / "scene.glb" for s in scenes}
+    files |= {f"meshes of {s.prediction.scene_id} (PLY)": s.folder / "meshes" for s in scenes}
+    files["numbers by room and by object"] = output / "evaluation"
+    files["trained network"] = fits[-1].checkpoint
+    files["the rooms"] = output / "rooms"
+    return files
+
+
+def _versions() -> dict[str, str]:
+    found = provenance()
+    commit = {"commit": found["git_commit"]} if found["git_commit"] else {}
+    return {**found["versions"], **commit, "platform": found["platform"]}
