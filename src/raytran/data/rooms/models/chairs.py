@@ -184,12 +184,19 @@ def _back(
         rails = [parts.cushion((0, y, 0), (2 * x, 0.055, 0.022), corner=0.01, edge=0.01) for y in heights]
         design.add(rails, frame)
     else:
-        angle = np.linspace(-1.0, 1.0, 9)
-        outer = np.stack([x * angle, 0.05 * (1 - angle**2) - 0.01], axis=1)
-        half = np.array([0, 0.012])
-        band = np.concatenate([outer[::-1] - half, outer + half])
-        design.add(parts.prism(band, 0.45 * rise, rise), cover)
+        design.add(_band(x, 0.55 * rise, 0.725 * rise), cover)
     return design
+
+
+def _band(reach: float, height: float, middle: float) -> parts.Part:
+    """Board across the back from -``reach`` to ``reach``, bent backwards in the middle."""
+    outline = parts.rectangle(0.024, height, 0.008, 2)
+    share = np.linspace(-1.0, 1.0, 9)
+    rings = np.empty((len(share), len(outline), 3))
+    rings[..., 0] = reach * share[:, None]
+    rings[..., 1] = middle + outline[:, 1]
+    rings[..., 2] = 0.05 * (1 - share[:, None] ** 2) - 0.01 + outline[:, 0]
+    return parts.loft(rings)
 
 
 def _bar_arms(design: Design, width: float, depth: float, seat: float, color: Color) -> None:

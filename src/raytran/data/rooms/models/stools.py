@@ -10,17 +10,15 @@ from raytran.data.rooms.models.design import Design
 
 
 def pedestal_stool(rng: np.random.Generator) -> Design:
-    """Bar stool: round seat, column and foot disc."""
+    """Bar stool: round seat, column and foot disc, with a plate for the feet if it is high."""
     design = Design("stool", symmetry=0)
     height, radius = rng.uniform(0.45, 0.78), rng.uniform(0.16, 0.21)
     metal = palette.pick(rng, palette.METALS)
     foot = 1.1 * radius
     design.add(parts.lathe([(foot, 0.0), (foot, 0.012), (0.03, 0.04), (0.03, height - 0.06)]), metal)
     if height > 0.6:
-        hoop = [(0.14, 0.25), (0.16, 0.25), (0.16, 0.27), (0.14, 0.27)]
-        design.add(parts.lathe(hoop, closed=True), metal)
-        design.add(parts.spokes(parts.tube([(0.0, 0.26, 0.0), (0.15, 0.26, 0.0)], 0.008), 4), metal)
-        design.symmetry = 4
+        rest = [(0.04, 0.25), (0.15, 0.255), (0.17, 0.265), (0.15, 0.275)]
+        design.add(parts.lathe([*rest, (0.04, 0.28)]), metal)
     seat = [
         (0.9 * radius, height - 0.07),
         (radius, height - 0.05),
