@@ -35,7 +35,7 @@ def build_model(cfg: DictConfig, *, pretrained: bool = True) -> RayTran:
 
     Args:
         cfg: the root config.
-        pretrained: False leaves out the image encoder's pretrained weights, because a checkpoint will fill it.
+        pretrained: False leaves out the image encoder's own weights, because a checkpoint will fill it.
     """
     config = plain(cfg.model)
     if not pretrained:

@@ -39,8 +39,8 @@ def run_curriculum(
 ) -> list[FitResult]:
     """Train the stages in turn, each from the weights of the one before.
 
-    Each stage is a fit of its own in ``output_dir/<experiment>``. A stage that has finished is skipped, one that
-    was interrupted goes on from its last checkpoint.
+    Each stage is a fit of its own in ``output_dir/<experiment>``. A stage that has finished is skipped, one
+    that was interrupted goes on from its last checkpoint.
 
     Args:
         overrides: settings for all stages as typed after ``python -m raytran.train``, without ``experiment``.
@@ -73,7 +73,7 @@ def run_curriculum(
 
 
 def _fit(settings: Sequence[str], folder: Path) -> FitResult:
-    """Train one stage: in this process on one device, else as a command of its own, whose ranks Lightning starts."""
+    """Train one stage: in this process on one device, else as a command of its own."""
     cfg = compose("train", settings)
     if str(cfg.trainer.devices) == "1" and cfg.trainer.num_nodes == 1:
         return train(cfg)
@@ -94,9 +94,10 @@ def _record(output_dir: Path, overrides: Sequence[str], stages: Sequence[str]) -
     if path.is_file():
         earlier = json.loads(path.read_text())
         if earlier != settings:
+            typed = " ".join(earlier["overrides"]) or "no overrides"
             raise ConfigError(
-                f"{output_dir} holds an unfinished curriculum with the settings {' '.join(earlier['overrides']) or 'none'}: "
-                "give those to continue it, or resume=none to start a new one"
+                f"{output_dir} holds an unfinished curriculum that was started with {typed}: "
+                "give the same to continue it, or resume=none to start a new one"
             )
         return
     output_dir.mkdir(parents=True, exist_ok=True)

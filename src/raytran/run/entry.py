@@ -24,8 +24,8 @@ from raytran.run.folders import register_resolvers
 def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], Any]]:
     """Turn ``function(cfg)`` into a command configured by ``conf/<config_name>.yaml``.
 
-    ``cfg.output_dir``, where there is one, is set to the absolute folder of this run. A ``RaytranError`` is printed as one sentence
-    and the command exits with 1; any other exception is a defect and shows its traceback.
+    ``cfg.output_dir``, where there is one, is set to the absolute folder of this run. A ``RaytranError`` is
+    printed as one sentence and the command exits with 1; any other exception is a defect, shown at length.
     """
     register_resolvers()
 
@@ -66,8 +66,8 @@ def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
 
     Args:
         config_name: root file in ``conf/`` without ending.
-        overrides: what a user would type, e.g. ``["preset=tiny", "experiment=stage2"]``. ``output_dir`` must be
-            among them if the result is to be run.
+        overrides: what a user would type, e.g. ``["preset=tiny", "experiment=stage2"]``. ``output_dir``
+            must be among them if the result is to be run.
     """
     register_resolvers()
     if GlobalHydra.instance().is_initialized():

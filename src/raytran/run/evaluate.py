@@ -86,8 +86,8 @@ def evaluate_model(
     Args:
         model: the network, on any device; put in evaluation mode.
         dataset: scenes with targets, each a ``SceneBatch`` with B = 1.
-        output: folder for ``metrics.json``, ``per_scene.csv`` and ``per_object.csv``, which appear together or not
-            at all; None writes nothing.
+        output: folder for ``metrics.json``, ``per_scene.csv`` and ``per_object.csv``, which appear together
+            or not at all; None writes nothing.
         score_threshold: objects with a lower score do not count as predicted.
         duplicate_iou: nor does one that overlaps a surer one of its class by more than this IoU.
         about: what to say beside the numbers, e.g. the checkpoint.

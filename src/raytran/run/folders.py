@@ -70,7 +70,7 @@ def read_finished(folder: Path) -> Finished | None:
 
 
 def newest_finished(outputs: Path, *, preset: str, stage: str) -> Path | None:
-    """Return the checkpoint of the newest finished run of ``stage`` with ``preset``, None if there is none."""
+    """Return the checkpoint of the newest finished run of ``stage`` with ``preset``, if there is one."""
     found = []
     for path in (outputs / preset).glob(f"**/{FINISHED}"):
         mark = read_finished(path.parent)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import lightning.pytorch as pl
+from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from omegaconf import DictConfig, OmegaConf
 
@@ -64,7 +65,7 @@ def train(cfg: DictConfig) -> FitResult:
     if finished is not None:
         return finished
     pl.seed_everything(run.seed, workers=True, verbose=False)
-    _quiet_lightning()
+    _quiet()
     module, resume_from, parent = _start(cfg, run)
     card = checkpoint_card(
         stage=module.stage.name,
@@ -120,8 +121,8 @@ def _start(cfg: DictConfig, run: RunConfig) -> tuple[Reconstruction, Path | None
         module = build_module(cfg, build_model(cfg, pretrained=False))
         if card["stage"] != module.stage.name:
             raise CheckpointError(
-                f"{last} is of stage {card['stage']}, not {module.stage.name}: choose the experiment that wrote it, "
-                f"or start a new run from its weights with init_from={last}"
+                f"{last} is of stage {card['stage']}, not {module.stage.name}: choose the experiment "
+                f"that wrote it, or start a new run from its weights with init_from={last}"
             )
         _log.info("continuing from step %d of %s", card["global_step"], last)
         return module, last, card["parent"]
@@ -154,8 +155,9 @@ def find_parent(run: RunConfig, stage: Stage) -> Path | None:
     found = newest_finished(Path(run.outputs), preset=run.preset, stage=stage.parent)
     if found is None:
         raise ConfigError(
-            f"no finished run of stage {stage.parent} with preset {run.preset} under {Path(run.outputs).resolve()}: "
-            f"run `python -m raytran.train experiment={stage.parent_experiment} preset={run.preset}` first, "
+            f"no finished run of stage {stage.parent} with preset {run.preset} under "
+            f"{Path(run.outputs).resolve()}: run `python -m raytran.train "
+            f"experiment={stage.parent_experiment} preset={run.preset}` first, "
             "or give init_from=CHECKPOINT, or init_from=none to start from scratch"
         )
     return found
@@ -178,8 +180,10 @@ def _describe_run(cfg: DictConfig, folder: Path) -> None:
         os.replace(partial, folder / name)
 
 
-def _quiet_lightning() -> None:
-    """Silence what Lightning tells every user at every start, and what this project has decided on purpose."""
+def _quiet() -> None:
+    """Silence what Lightning tells everybody at every start, what is so on purpose here, and ranks but the first."""
+    if rank_zero_only.rank != 0:
+        logging.getLogger("raytran").setLevel(logging.WARNING)
     for name in ("lightning.pytorch", "lightning.fabric"):
         logger = logging.getLogger(name)
         logger.setLevel(logging.WARNING)
@@ -190,6 +194,6 @@ def _quiet_lightning() -> None:
         ".*in eval mode at the start of training.*",
         ".*isinstance.treespec, LeafSpec.*",
         ".*smaller than the logging interval.*",
-        ".*Checkpoint directory .* exists.*",
+        ".*recommended to use .*sync_dist=True.*",  # the metrics have gathered over the ranks themselves
     ):
         warnings.filterwarnings("ignore", message=pattern)

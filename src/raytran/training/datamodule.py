@@ -24,7 +24,8 @@ class SceneDataModule(pl.LightningDataModule):
         root: folder with ``scannet``, ``scan2cad`` and ``shapenet``.
         dataset: ``dataset(root=…, split="train"|"val", view_choice=…, num_views=…, targets=…)``.
         targets: what batches must hold, see ``SceneDataset``.
-        make: ``make(output=root)`` writes the data; it does nothing where they are complete. None: data are given.
+        make: ``make(output=root)`` writes the data and does nothing where they are complete; None if they are
+            there in any case.
         num_views: frames of a training scene, drawn at random anew each time.
         val_views: frames of a validation scene, evenly spread.
         batch_size: scenes per device.
@@ -62,7 +63,7 @@ class SceneDataModule(pl.LightningDataModule):
             self._make(output=self.root)
 
     def split(self, split: str, *, training: bool = False) -> Dataset[SceneBatch]:
-        """Return the scenes of ``train`` or ``val``, with random views for training, else evenly spread ones."""
+        """Return the scenes of ``train`` or ``val``; with random views for training, else even ones."""
         return self._dataset(
             root=self.root,
             split=split,
@@ -77,7 +78,7 @@ class SceneDataModule(pl.LightningDataModule):
         return self._loader(dataset, EpochSampler(dataset, **self._ranks(), seed=self._seed))
 
     def val_dataloader(self) -> DataLoader[SceneBatch]:
-        """Return the validation scenes in order (on several ranks a few come twice to fill up the last batch)."""
+        """Return the validation scenes in order; on several ranks a few come twice, to make them even."""
         dataset = self.split("val")
         return self._loader(dataset, DistributedSampler(dataset, **self._ranks(), shuffle=False))
 
@@ -99,7 +100,7 @@ class SceneDataModule(pl.LightningDataModule):
 
 
 class EpochSampler(DistributedSampler[Any]):
-    """Gives (epoch, index) pairs, so that worker processes that live on know which epoch they draw frames for."""
+    """Gives (epoch, index) pairs: worker processes that live on learn which epoch they draw frames for."""
 
     def __iter__(self) -> Iterator[Any]:
         """Yield the pairs of this rank."""

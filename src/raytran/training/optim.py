@@ -17,8 +17,8 @@ from torch.optim.lr_scheduler import LambdaLR
 def learning_rate_factor(step: int, *, total_steps: int, warmup_steps: int, decay: str) -> float:
     """Return what the learning rate is multiplied with before step ``step`` (counted from 0).
 
-    Rises linearly over ``warmup_steps``; then stays 1 (``decay="none"``) or falls to 0 at ``total_steps`` along
-    a half cosine (``decay="cosine"``).
+    Rises linearly over ``warmup_steps``; then stays 1 (``decay="none"``) or falls to 0 at ``total_steps``
+    along a half cosine (``decay="cosine"``).
     """
     if step < warmup_steps:
         return (step + 1) / warmup_steps

@@ -20,9 +20,9 @@ _log = logging.getLogger(__name__)
 class LastCheckpoint(pl.Callback):
     """Writes ``path`` and puts the run's card into it.
 
-    The first Ctrl-C lets the step in hand finish, so that the weights on disk are those of a whole step; a second
-    one stops at once and leaves the last periodic checkpoint. With several processes a rank cannot know at
-    which step the others stop, so there only the periodic checkpoint remains.
+    The first Ctrl-C lets the step in hand finish, so that the weights on disk are those of a whole step; a
+    second one stops at once and leaves the last periodic checkpoint. With several processes a rank cannot
+    know at which step the others stop, so there only the periodic checkpoint remains.
 
     Args:
         path: the file to write.

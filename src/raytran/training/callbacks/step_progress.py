@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Progress of a fit in optimiser steps: stages are counted in steps, and an epoch may be a handful of rooms."""
+"""Progress of a fit in steps: stages are counted in steps, and an epoch may be a handful of rooms."""
 
 from __future__ import annotations
 
