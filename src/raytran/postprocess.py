@@ -78,5 +78,7 @@ def _unit_surface(probability: NDArray[np.float32]) -> tuple[NDArray[np.float64]
     if not (probability > 0.5).any():
         return None
     # One layer of empty cells around the grid closes a shape that reaches the sides of its box.
-    vertices, faces, _, _ = marching_cubes(np.pad(probability, 1), level=0.5, method="lewiner")
+    # "ascent": values grow towards the object, which makes its faces counter-clockwise from outside.
+    padded = np.pad(probability, 1)
+    vertices, faces, _, _ = marching_cubes(padded, level=0.5, method="lewiner", gradient_direction="ascent")
     return (vertices.astype(np.float64) - 0.5) / probability.shape[0] - 0.5, faces.astype(np.int64)

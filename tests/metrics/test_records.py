@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Metrics over objects in a distributed run: two gloo processes with unequal scenes, then one with none."""
+
+from __future__ import annotations
+
+import copy
+import json
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from raytran.geometry.rotation import rotation_from_yaw
+from raytran.metrics import ForegroundIoU, OrientedBoxF1, Scan2CADAccuracy, SceneOccupancyIoU
+from raytran.metrics.records import SceneRecord, decode_records
+from raytran.types import ObjectSet
+
+SCENES = 7
+SHARES = {"unequal": ((0, 3, 5, 6), (1, 2, 4)), "one without": ((0, 1, 2, 3, 4, 5, 6), ()),
+          "repeated": ((0, 1, 2, 3), (4, 5, 6, 0))}  # fmt: skip
+
+
+def scene(index: int) -> tuple[ObjectSet, ObjectSet, str]:
+    generator = torch.Generator().manual_seed(index)
+    count = index  # scene 0 has no objects
+    target = ObjectSet(
+        label=torch.randint(0, 9, (count,), generator=generator),
+        center=torch.rand(count, 3, generator=generator) * 4,
+        size=torch.rand(count, 3, generator=generator) + 0.3,
+        rotation=rotation_from_yaw(torch.rand(count, generator=generator)),
+        symmetry=torch.ones(count, dtype=torch.int64),
+        score=torch.ones(count),
+    )
+    copies = target.select(torch.randint(0, max(count, 1), (2 * count,), generator=generator))
+    shift = 0.08 * torch.randn(2 * count, 3, generator=generator)
+    score = torch.rand(2 * count, generator=generator)
+    return ObjectSet(
+        copies.label, copies.center + shift, copies.size, copies.rotation, copies.symmetry, score
+    ), target, f"scene{index:04d}_00 – ü"  # fmt: skip
+
+
+def results(indices: tuple[int, ...]) -> dict:
+    """Everything the metrics return for a share of the scenes, scenes given one by one."""
+    scan2cad, box_f1 = Scan2CADAccuracy(), OrientedBoxF1()
+    occupancy, foreground = SceneOccupancyIoU(), ForegroundIoU()
+    for index in indices:
+        prediction, target, name = scene(index)
+        for metric in (scan2cad, box_f1):
+            metric.update([prediction], [target], [name])
+        generator = torch.Generator().manual_seed(index)
+        probability, truth = torch.rand(2, 1, 4, 4, 2, generator=generator)
+        occupancy.update(probability, truth > 0.5)
+        foreground.update(probability[..., 0], truth[..., 0] > 0.5)
+    found = {"scan2cad": scan2cad.compute(), "box_f1": box_f1.compute()}
+    found |= {"occupancy": occupancy.compute().item(), "foreground": foreground.compute().item()}
+    for key, metric in (("scan2cad", scan2cad), ("box_f1", box_f1)):
+        for per in ("object", "scene"):
+            found[f"{key} {per}"] = sorted(
+                metric.rows(per), key=lambda row: (row["scene_id"], row.get("object"))
+            )
+    return found
+
+
+@pytest.fixture(scope="module")
+def found_by_ranks(tmp_path_factory) -> list[dict]:
+    """What each of two processes finds, for all shares of the scenes in turn."""
+    folder = tmp_path_factory.mktemp("ranks")
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, __file__, str(folder)]
+    ranks = [subprocess.Popen([*command, rank], env=environment) for rank in "01"]
+    assert [rank.wait(timeout=240) for rank in ranks] == [0, 0]
+    return [json.loads((folder / f"{rank}.json").read_text()) for rank in "01"]
+
+
+@pytest.mark.parametrize("share", list(SHARES))
+def test_two_ranks_equal_one_process(share, found_by_ranks):
+    expected = json.loads(json.dumps(results(tuple(range(SCENES)))))
+    assert expected["scan2cad"]["n_good"] > 5
+    for found in (by_share[share] for by_share in found_by_ranks):
+        if share == "repeated":  # sums over pixels have no names to know a repeated scene by
+            found = found | {key: expected[key] for key in ("occupancy", "foreground")}
+        assert found == expected
+
+
+def test_records_survive_encoding():
+    records = [
+        SceneRecord("scene0470_00", torch.rand(3, 2).double(), torch.rand(0, 4).double()),
+        SceneRecord("", torch.zeros(0, 2).double(), torch.full((2, 4), torch.nan).double()),
+        SceneRecord("客厅", torch.rand(1, 2).double(), torch.rand(1, 4).double()),
+    ]
+    decoded = list(decode_records(torch.cat([record.encode() for record in records]), 2, 4))
+    for record, copied in zip(records, decoded, strict=True):
+        assert copied.scene_id == record.scene_id
+        torch.testing.assert_close(copied.truths, record.truths, rtol=0, atol=0)
+        torch.testing.assert_close(copied.predictions, record.predictions, rtol=0, atol=0, equal_nan=True)
+
+
+def test_copy_reset_and_move():
+    prediction, target, name = scene(5)
+    metric = Scan2CADAccuracy()
+    metric.update([prediction], [target], [name])
+    result = metric.compute()
+    for twin in (copy.deepcopy(metric), pickle.loads(pickle.dumps(metric)), metric.to("cpu").half()):
+        twin.update([prediction], [target], ["another"])
+        assert twin.compute()["n_total"] == 2 * result["n_total"]
+    metric.reset()
+    assert metric.rows() == []
+
+
+def run_rank(folder: str, rank: str) -> None:
+    torch.distributed.init_process_group("gloo", f"file://{folder}/meeting", rank=int(rank), world_size=2)
+    found = {share: results(scenes[int(rank)]) for share, scenes in SHARES.items()}
+    (Path(folder) / f"{rank}.json").write_text(json.dumps(found))
+    torch.distributed.destroy_process_group()
+
+
+if __name__ == "__main__":
+    run_rank(*sys.argv[1:])
