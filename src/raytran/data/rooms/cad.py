@@ -22,6 +22,7 @@ from raytran.data.rooms.models import (
     shelves,
     sofas,
     stools,
+    swivels,
     tables,
 )
 from raytran.data.rooms.models.design import Design
@@ -48,7 +49,7 @@ RECIPES: dict[str, tuple[tuple[float, Recipe], ...]] = {
     "chair": (
         (0.34, chairs.four_legged_chair),
         (0.10, chairs.cantilever_chair),
-        (0.28, chairs.office_chair),
+        (0.28, swivels.office_chair),
         (0.12, chairs.armchair),
         (0.06, stools.pedestal_stool),
         (0.06, stools.legged_stool),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chairs with a back: wooden and metal ones on four legs, cantilevers, office chairs, armchairs."""
+"""Chairs with a back: wooden and metal ones on four legs, cantilevers, armchairs."""
 
 from __future__ import annotations
 
@@ -21,10 +21,8 @@ def four_legged_chair(rng: np.random.Generator) -> Design:
     _legs(design, rng, width, depth, seat - 0.03, frame)
     back = _back(rng, width, rise, depth, frame, cover)
     for part, color in back.parts:
-        design.add(
-            parts.tilted(parts.moved(part, (0, seat - 0.03, depth / 2 - 0.03)), lean, (0, seat, depth / 2)),
-            color,
-        )
+        placed = parts.moved(part, (0, seat - 0.03, depth / 2 - 0.03))
+        design.add(parts.tilted(placed, lean, (0, seat, depth / 2)), color)
     if arms:
         _bar_arms(design, width, depth, seat, frame)
     return design
@@ -37,72 +35,20 @@ def cantilever_chair(rng: np.random.Generator) -> Design:
     width, depth, seat, top = rng.uniform(0.45, 0.54), rng.uniform(0.44, 0.52), 0.45, rng.uniform(0.8, 0.92)
     steel, cover = palette.pick(rng, palette.METALS), palette.pick(rng, palette.FABRICS)
     x, front, rear = width / 2, -depth / 2, depth / 2
-    path = [
-        (x, 0.012, rear),
-        (x, 0.012, front + 0.06),
-        (x, 0.03, front + 0.015),
-        (x, 0.07, front),
-        (x, seat - 0.06, front),
-    ]
-    path += [(x, seat - 0.02, front + 0.015), (x, seat, front + 0.06), (x, seat, rear - 0.06)]
-    path += [(x, seat + 0.02, rear - 0.015), (x, seat + 0.06, rear), (x, top, rear + 0.07)]
-    design.add(parts.both_sides(parts.tube(path, 0.012)), steel)
+    # (height, z) along the tube: on the floor, up in front, under the seat, up the back.
+    bends = [(0.012, rear), (0.012, front + 0.06), (0.03, front + 0.015), (0.07, front), (seat - 0.06, front)]
+    bends += [(seat - 0.02, front + 0.015), (seat, front + 0.06), (seat, rear - 0.06)]
+    bends += [(seat + 0.02, rear - 0.015), (seat + 0.06, rear), (top, rear + 0.07)]
+    design.add(parts.both_sides(parts.tube([(x, y, z) for y, z in bends], 0.012)), steel)
     design.add(parts.tube([(-x, 0.012, rear), (x, 0.012, rear)], 0.012), steel)
-    design.add(
-        parts.cushion((0, seat + 0.015, 0), (width - 0.01, 0.045, depth - 0.03), corner=0.04, edge=0.018),
-        cover,
-    )
-    height = top - seat - 0.14
-    panel = parts.cushion((0, 0, 0), (width - 0.01, height, 0.04), corner=0.015, edge=0.015)
-    design.add(
-        parts.tilted(parts.moved(panel, (0, top - height / 2, rear + 0.03)), 9, (0, top, rear + 0.03)), cover
-    )
+    pad = (0, seat + 0.015, 0), (width - 0.01, 0.045, depth - 0.03)
+    design.add(parts.cushion(*pad, corner=0.04, edge=0.018), cover)
+    height, pivot = top - seat - 0.14, (0, top, rear + 0.03)
+    panel = (0, top - height / 2, rear + 0.03), (width - 0.01, height, 0.04)
+    design.add(parts.tilted(parts.cushion(*panel, corner=0.015, edge=0.015), 9, pivot), cover)
     if arms:
-        rest = parts.tube(
-            [(x, seat, front + 0.07), (x, seat + 0.2, front + 0.1), (x, seat + 0.21, rear + 0.02)], 0.014
-        )
-        design.add(parts.both_sides(rest), steel)
-    return design
-
-
-def office_chair(rng: np.random.Generator) -> Design:
-    """Swivel chair: five-star base on castors, gas column, cushions, mostly with arms."""
-    design = Design("office chair")
-    width, depth, seat = rng.uniform(0.46, 0.54), rng.uniform(0.44, 0.52), rng.uniform(0.44, 0.54)
-    rise, lean = rng.uniform(0.42, 0.72), rng.uniform(5, 14)
-    frame, cover = palette.pick(rng, palette.METALS), palette.pick(rng, palette.FABRICS)
-    _star_base(design, rng.uniform(0.27, 0.33), seat - 0.08, frame)
-    design.add(parts.box((0, seat - 0.09, 0), (0.22, 0.04, 0.26)), frame)
-    design.add(parts.cushion((0, seat - 0.035, 0), (width, 0.08, depth), corner=0.09, edge=0.035), cover)
-    low, rear = seat + rng.uniform(0.04, 0.12), depth / 2
-    back = parts.cushion((0, low + rise / 2, rear + 0.02), (0.92 * width, rise, 0.07), corner=0.03, edge=0.05)
-    spine = parts.tube(
-        [(0, seat - 0.09, 0.1), (0, seat - 0.08, rear), (0, seat, rear + 0.05), (0, low + 0.2, rear + 0.05)],
-        0.022,
-    )
-    design.add(parts.tilted(back, lean, (0, seat, rear)), cover)
-    design.add(parts.tilted(spine, 0.6 * lean, (0, seat, rear)), frame)
-    if rise > 0.55 and rng.random() < 0.6:
-        rest = parts.cushion(
-            (0, low + rise + 0.08, rear + 0.01), (0.5 * width, 0.14, 0.06), corner=0.03, edge=0.04
-        )
-        stem = parts.box((0, low + rise, rear + 0.03), (0.05, 0.14, 0.02))
-        design.add(parts.tilted(rest, lean, (0, seat, rear)), cover)
-        design.add(parts.tilted(stem, lean, (0, seat, rear)), frame)
-    if rng.random() < 0.75:
-        x, high = width / 2 + 0.03, seat + rng.uniform(0.17, 0.23)
-        post = parts.tube(
-            [
-                (0.1, seat - 0.09, 0.02),
-                (x - 0.03, seat - 0.09, 0.02),
-                (x, seat - 0.05, 0.02),
-                (x, high, 0.02),
-            ],
-            0.016,
-        )
-        pad = parts.cushion((x, high, 0), (0.075, 0.035, 0.26), corner=0.03, edge=0.012)
-        design.add(parts.both_sides(post), frame)
-        design.add(parts.both_sides(pad), palette.RUBBER)
+        rest = [(x, seat, front + 0.07), (x, seat + 0.2, front + 0.1), (x, seat + 0.21, rear + 0.02)]
+        design.add(parts.both_sides(parts.tube(rest, 0.014)), steel)
     return design
 
 
@@ -112,31 +58,19 @@ def armchair(rng: np.random.Generator) -> Design:
     width, depth, seat = rng.uniform(0.5, 0.6), rng.uniform(0.62, 0.75), rng.uniform(0.38, 0.44)
     arm, top = rng.uniform(0.1, 0.17), rng.uniform(0.78, 1.0)
     cover = palette.pick(rng, palette.FABRICS)
-    foot, base = 0.1, seat - 0.14
-    leg = parts.tube(
-        [
-            (width / 2 + arm - 0.07, 0, depth / 2 - 0.08),
-            (width / 2 + arm - 0.09, foot + 0.02, depth / 2 - 0.1),
-        ],
-        [0.014, 0.024],
-    )
+    foot, base, high = 0.1, seat - 0.14, seat + rng.uniform(0.14, 0.22)
+    x, z = width / 2 + arm - 0.07, depth / 2 - 0.08
+    leg = parts.tube([(x, 0, z), (x - 0.02, foot + 0.02, z - 0.02)], [0.014, 0.024])
     design.add(parts.corners(leg), palette.pick(rng, palette.WOODS))
     frame = (0, (foot + base) / 2, 0), (width + 2 * arm - 0.03, base - foot, depth - 0.02)
     design.add(parts.cushion(*frame, corner=0.05, edge=0.02), palette.shade(cover, 0.9))
     pillow = (0, seat - 0.07, -0.05), (width - 0.01, 0.15, depth - 0.14)
     design.add(parts.cushion(*pillow, corner=0.05, edge=0.045), palette.shade(cover, 1.06))
-    high = seat + rng.uniform(0.14, 0.22)
-    side = parts.cushion(
-        (width / 2 + arm / 2, (foot + high) / 2, -0.01),
-        (arm, high - foot, depth - 0.03),
-        corner=0.05,
-        edge=0.05,
-    )
-    design.add(parts.both_sides(side), cover)
-    back = parts.cushion(
-        (0, (foot + top) / 2, depth / 2 - 0.06), (width + 0.04, top - foot, 0.15), corner=0.05, edge=0.06
-    )
-    design.add(parts.tilted(back, rng.uniform(3, 9), (0, foot, depth / 2)), cover)
+    side = (width / 2 + arm / 2, (foot + high) / 2, -0.01), (arm, high - foot, depth - 0.03)
+    design.add(parts.both_sides(parts.cushion(*side, corner=0.05, edge=0.05)), cover)
+    back = (0, (foot + top) / 2, depth / 2 - 0.06), (width + 0.04, top - foot, 0.15)
+    lean, pivot = rng.uniform(3, 9), (0, foot, depth / 2)
+    design.add(parts.tilted(parts.cushion(*back, corner=0.05, edge=0.06), lean, pivot), cover)
     return design
 
 
@@ -210,13 +144,3 @@ def _bar_arms(design: Design, width: float, depth: float, seat: float, color: Co
         edge=0.008,
     )
     design.add([*parts.both_sides(post), *parts.both_sides(rest)], color)
-
-
-def _star_base(design: Design, radius: float, top: float, color: Color) -> None:
-    """Five arms with castors and the gas column."""
-    arm = parts.tube([(0, 0.10, 0), (0, 0.075, -radius)], [0.026, 0.016])
-    wheel = parts.tube([(-0.025, 0.028, -radius), (0.025, 0.028, -radius)], 0.028, 12)
-    fork = parts.tube([(0, 0.03, -radius), (0, 0.085, -radius)], 0.01)
-    design.add(parts.spokes(arm, 5) + parts.spokes(fork, 5), color)
-    design.add(parts.spokes(wheel, 5), palette.RUBBER)
-    design.add(parts.lathe([(0.035, 0.06), (0.035, 0.25), (0.022, 0.26), (0.022, top)], 16), color)
