@@ -98,7 +98,7 @@ class Scan2CADAccuracy(SceneRecordMetric):
         )
 
     def compute(self) -> Scan2CADResult:
-        """Return the accuracy of each class, their mean over the classes that occur, and that of all objects."""
+        """Return the accuracy of each class, the mean over those that occur, and that of all objects."""
         scenes = self.scenes()
         truths = torch.cat([torch.zeros(0, self.truth_columns), *(scene.truths for scene in scenes)])
         label, found = truths[:, 0].long(), truths[:, 1] == 1

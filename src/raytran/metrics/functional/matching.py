@@ -28,7 +28,7 @@ def match_in_order(order: Tensor, allowed: Tensor, preference: Tensor | None = N
     wish = allowed.double() if preference is None else preference.double()
     wish = torch.where(allowed, wish, -torch.inf)
     for index in order[allowed[order].any(dim=1)].tolist():
-        best, choice = wish[index].max(dim=0)  # the first of equals on the CPU
+        best, choice = wish[index].max(dim=0)  # the first of equals
         if best > -torch.inf:
             match[index] = choice
             wish[:, choice] = -torch.inf
