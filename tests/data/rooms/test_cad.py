@@ -108,7 +108,7 @@ def test_no_higher_symmetry_is_hidden(index: int) -> None:
 @cache
 def draws(category: str) -> list[CadModel]:
     rng = np.random.default_rng(0)
-    return [sample_model(category, rng) for _ in range(60)]
+    return [sample_model(category, rng) for _ in range(100)]
 
 
 def test_kinds_of_the_issue_are_all_drawn() -> None:
