@@ -38,7 +38,12 @@ _LEAST_SHARE = 0.0012
 
 @dataclass(frozen=True)
 class _Survey:
-    """What can be seen from where: ``position`` (p, 2), ``share`` (p, _HEADINGS, M) of the picture per object."""
+    """What can be seen from where.
+
+    Attributes:
+        position: ``(p, 2)`` places on the floor plan, metres.
+        share: ``(p, headings, M)`` of the picture that each object covers.
+    """
 
     position: NDArray[np.float64]
     share: NDArray[np.float64]
@@ -136,7 +141,7 @@ def _survey(free: NDArray[np.bool_], boxes: Boxes, renderer: Renderer, rng: np.r
     ).reshape(len(cells), _HEADINGS, len(boxes))
     width = round(_HEADINGS * FIELD_OF_VIEW / (2 * np.pi))
     window = ndimage.uniform_filter1d(seen.astype(np.float64), width, axis=1, mode="wrap")
-    return _Survey(position, window / _PITCHES)
+    return _Survey(np.asarray(position, dtype=np.float64), window / _PITCHES)
 
 
 def _choose_stations(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What stands in which kind of room: desks with displays and chairs, sofas with coffee tables, beds with pillows."""
+"""What stands in which kind of room: desks with displays and chairs, sofas with coffee tables, beds."""
 
 from __future__ import annotations
 
@@ -32,9 +32,15 @@ _EXTRAS: dict[str, dict[str, float]] = {
     "living": {"bookshelf": 3, "cabinet": 2, "trashbin": 1, "chair": 2, "lamp": 3, "sofa": 2, "pillow": 2},
     "bedroom": {"bookshelf": 2, "cabinet": 3, "trashbin": 1, "chair": 1, "lamp": 3, "pillow": 2},
     "dining": {"bookshelf": 1, "cabinet": 4, "trashbin": 3, "chair": 1, "lamp": 1},
-    "meeting": {"bookshelf": 3, "cabinet": 2, "trashbin": 2, "chair": 3, "display": 1},
-    "bathroom": {"cabinet": 3, "trashbin": 3, "chair": 2, "bathtub": 1},
+    "meeting": {"bookshelf": 3, "cabinet": 2, "trashbin": 2, "chair": 3, "printer": 1},
+    "bathroom": {"cabinet": 3, "trashbin": 2, "chair": 2, "lamp": 1},
 }
+_OTHERS = {
+    "printer": ("printer", "copier"),
+    "lamp": ("floor lamp", "table lamp"),
+    "pillow": ("pillow",),
+}
+_MOST = {"trashbin": 2, "lamp": 3, "sofa": 2, "printer": 2, "pillow": 4}
 
 
 @dataclass
@@ -69,22 +75,18 @@ class Furnisher:
     def extra(self, name: str) -> None:
         """Place one more piece; nothing happens if it finds no place."""
         rng, layout = self.layout.rng, self.layout
-        if name in ("printer", "lamp", "pillow"):
-            kinds = {
-                "printer": ("printer", "copier"),
-                "lamp": ("floor lamp", "table lamp"),
-                "pillow": ("pillow",),
-            }
-            model = self.draw("other", *kinds[name])
-        else:
-            model = self.draw(name)
+        kinds = _OTHERS.get(name, ())
+        present = [o for o in layout.objects if o.model.category == name or o.model.kind in kinds]
+        if len(present) >= _MOST.get(name, self.wanted):
+            return
+        model = self.draw("other", *kinds) if kinds else self.draw(name)
         if model is None:
             return
         if model.support in ("table", "bed"):
             self.on_something(model)
-        elif model.support == "wall" or name in ("sofa", "bathtub", "trashbin", "lamp", "printer"):
-            layout.at_wall(model)
-        elif rng.random() < 0.5 or layout.anywhere(model) is None:
+        elif model.support == "floor" and name in ("chair", "table") and rng.random() < 0.6:
+            layout.anywhere(model)
+        else:
             layout.at_wall(model)
 
     def on_something(self, model: CadModel) -> int | None:
@@ -144,7 +146,9 @@ class Furnisher:
             return
         middle = np.array(layout.room.size[:2]) / 2
         table = None
-        for _ in range(15):
+        for attempt in range(20):
+            if attempt == 10:
+                model = self.draw("table", *_DINING) or model
             turn = rng.integers(4) * np.pi / 2 + rng.normal(0, 0.05)
             table = layout.on_floor(model, middle + rng.normal(0, 0.5, size=2), turn)
             if table is not None:
@@ -186,7 +190,7 @@ class Furnisher:
             reach = layout.objects[sofa].box.half[0, 2] + layout.size_of(low)[2] / 2 + rng.uniform(0.3, 0.5)
             spot = layout.objects[sofa].box.center[0, :2] + front * reach
             layout.on_floor(low, spot, float(np.arctan2(-front[0], front[1])) + rng.normal(0, 0.05))
-        for _ in range(int(rng.integers(0, 3))):
+        for _ in range(int(rng.integers(0, 4))):
             pillow = self.draw("other", "pillow")
             if pillow is not None:
                 layout.on_top(sofa, pillow)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Furnished rooms by the number, in the raw layout of ScanNet, ShapeNet and Scan2CAD (see ``generate_rooms``)."""
+"""Furnished rooms by the number, in the raw layout of ScanNet, ShapeNet and Scan2CAD."""
 
 from __future__ import annotations
 
@@ -69,8 +69,8 @@ def generate_rooms(
 ) -> RoomsReport:
     """Make a data set of furnished rooms, or finish one that was begun.
 
-    Each scene follows from ``seed`` and its number alone. A scan whose folder carries its final name is finished;
-    calling again makes what is missing. An interrupt lets the rooms in work finish and leaves nothing half-written.
+    Each scene follows from ``seed`` and its number alone. A scan whose folder carries its final name is
+    finished; calling again makes what is missing. An interrupt leaves nothing half-written.
 
     Args:
         output: folder that gets ``scannet/``, ``shapenet/``, ``scan2cad/`` and ``rooms.json``.
@@ -101,14 +101,8 @@ def generate_rooms(
     missing = [number for number, scan_id in enumerate(scan_ids) if not (scans / scan_id).is_dir()]
     _make_all(output, settings, missing, processes, progress)
     objects = _write_lists(output, scan_ids, num_train)
-    return RoomsReport(
-        root=output,
-        train=tuple(scan_ids[:num_train]),
-        val=tuple(scan_ids[num_train:]),
-        made=len(missing),
-        objects=objects,
-        seconds=time.monotonic() - started,
-    )
+    train, val = tuple(scan_ids[:num_train]), tuple(scan_ids[num_train:])
+    return RoomsReport(output, train, val, len(missing), objects, time.monotonic() - started)
 
 
 def make_room_scan(output: Path, settings: RoomSettings, number: int) -> int:

@@ -186,11 +186,11 @@ def _draw_tilt(rng: np.random.Generator) -> NDArray[np.float64]:
 def _surface(base: PlacedObject) -> Callable[[NDArray[np.float64], NDArray[np.float64]], float | None]:
     """Return a function that finds where something with a given footprint can stand on ``base``.
 
-    It takes the middle ``(2,)`` and the half extents ``(2,)`` of the footprint in the base's frame turned upright
-    (origin at the CAD origin, metres) and returns the height of the surface, or None where the surface is not
-    flat, too high to be reached, or absent.
+    It takes the middle ``(2,)`` and the half extents ``(2,)`` of the footprint in the base's frame turned
+    upright (origin at the CAD origin, metres) and returns the height of the surface, or None where the
+    surface is not flat, too high to be reached, or absent.
     """
-    upright = (base.model.vertices * base.scale) @ upright_rotation(0.0).T
+    upright = (base.model.vertices * base.scale)[:, [0, 2, 1]] * np.array([1.0, -1.0, 1.0])
     scene = EmbreeScene()
     TriangleMesh(scene, np.ascontiguousarray(upright[base.model.faces], dtype=np.float32))
     top = float(upright[:, 2].max()) + 0.1

@@ -101,7 +101,7 @@ def texture_library() -> TextureLibrary:
 
 
 def value_noise(rng: np.random.Generator, cells: tuple[int, int]) -> NDArray[np.float64]:
-    """Return ``(SIZE, SIZE)`` periodic noise: random values on a lattice of ``cells``, smoothly interpolated."""
+    """Return ``(SIZE, SIZE)`` periodic noise: random values on a lattice, smoothly interpolated."""
     lattice = rng.random(cells)
     result = lattice
     for axis, count in enumerate(cells):
@@ -199,5 +199,6 @@ def floor_paint(rng: np.random.Generator, *, wet: bool) -> Paint:
     if texture in ("planks", "parquet"):
         return tinted(rng.uniform(0.05, 0.1), rng.uniform(0.3, 0.6), rng.uniform(0.4, 0.8), 0.45, texture)
     contrast = 0.35 if texture == "tiles" else 0.3
-    saturation = rng.uniform(0.1, 0.35) if rng.random() < 0.3 else rng.uniform(0.0, 0.12)
+    colorful = texture == "carpet" and rng.random() < 0.4
+    saturation = rng.uniform(0.1, 0.35) if colorful else rng.uniform(0.0, 0.1)
     return tinted(rng.random(), saturation, rng.uniform(0.35, 0.85), contrast, texture)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pictures of a furnished room by ray casting: Lambert shading, one shadow ray a pixel, clean edges.
 
-Rays are cast by Embree; everything else is NumPy in float32. Sums are written out instead of matrix products, so
-that the bits do not depend on the number of threads of BLAS.
+Rays are cast by Embree; everything else is NumPy in float32. Sums are written out instead of matrix products,
+so that the bits do not depend on the number of threads of BLAS.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Pinhole:
     image_size: tuple[int, int]
 
     def directions(self, u: Floats, v: Floats) -> Floats:
-        """Return unnormalised ray directions ``(n, 3)`` of depth 1 through image points ``u``, ``v`` ``(n,)``."""
+        """Return ray directions ``(n, 3)`` of depth 1 through the image points ``u``, ``v`` ``(n,)``."""
         rows = self.room_from_camera[:3, :3] @ np.linalg.inv(self.intrinsics)
         a, b, c = (rows[:, i].astype(np.float32) for i in range(3))
         return u[:, None] * a + v[:, None] * b + c
@@ -81,7 +81,7 @@ class Renderer:
         self.exposure = 1.0
 
     def owners(self, camera: Pinhole, step: int) -> NDArray[np.int32]:
-        """Return the owner of the surface seen by each ``step × step`` block of pixels, ``(H/step · W/step,)``."""
+        """Return who owns what each ``step × step`` block of pixels sees, ``(H/step · W/step,)``."""
         prim = self.first_hit(camera.room_from_camera[:3, 3], camera.pixel_rays(step))
         return np.where(prim < 0, -1, self._surfaces.owner[prim]).astype(np.int32)
 
@@ -97,11 +97,12 @@ class Renderer:
 
     def expose(self, cameras: Sequence[Pinhole], brightness: float) -> None:
         """Set the exposure so that the mean linear value over coarse pictures is ``brightness``."""
+        self.exposure = 1.0
         means = []
         for camera in cameras:
             rays = camera.pixel_rays(max(1, camera.image_size[0] // 24))
-            color, _, _ = self._shade(camera, rays, np.arange(len(rays)) & 3)
-            means.append(float(np.minimum(color, 4.0).mean()))
+            color, _, lamp = self._shade(camera, rays, np.arange(len(rays)) & 3)
+            means.append(float((color + lamp).mean()))
         self.exposure = brightness / max(float(np.mean(means)), 1e-3)
 
     def render(self, camera: Pinhole, noise: Floats) -> NDArray[np.uint8]:
@@ -144,7 +145,7 @@ class Renderer:
             corner: ``(n,)`` which quarter of a lamp the shadow ray aims at.
 
         Returns:
-            light without the lamp that casts shadows ``(n, 3)``, patch seen ``(n,)``, light of that lamp ``(n, 3)``.
+            light but for the lamp that casts shadows ``(n, 3)``, patch seen ``(n,)``, that lamp's ``(n, 3)``.
         """
         eye = camera.room_from_camera[:3, 3].astype(np.float32)
         hit = self._scene.run(np.ascontiguousarray(np.broadcast_to(eye, rays.shape)), rays, output=1)
@@ -205,7 +206,7 @@ class Renderer:
         return strength[:, None] * source.color.astype(np.float32)
 
     def _number_patches(self) -> NDArray[np.int32]:
-        """Number the sets of triangles between which no edge shows: same owner, colour and roughly same normal."""
+        """Number the sets of triangles between which no edge shows: equal owner and colour, like normals."""
         keys = np.column_stack(
             [
                 self._surfaces.owner,
@@ -214,7 +215,7 @@ class Renderer:
                 self._surfaces.texture,
             ]
         ).astype(np.int64)
-        # A sum of the columns times large odd numbers is as good as unique and much faster than np.unique(axis=0).
+        # The columns' sum weighted by large odd numbers is as good as unique, and np.unique(axis=0) is slow.
         odd = np.array(
             [0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D, 0x27D4EB2F, 0x165667B1, 0xD3A2646D, 0xFD7046C5, 0xB55A4F09]
         )

@@ -102,7 +102,7 @@ class Room:
     surfaces: Surfaces
 
     def keep_free(self) -> NDArray[np.float64]:
-        """Return boxes ``(n, 2, 3)`` (lower, upper) where no furniture may stand: before doors and windows."""
+        """Return boxes ``(n, 2, 3)`` (lower, upper) where no furniture may stand: at doors and windows."""
         boxes = []
         for opening in self.openings:
             depth = 0.85 if opening.kind == "door" else 0.12
@@ -121,8 +121,7 @@ def make_room(kind: str, size: tuple[float, float, float], rng: np.random.Genera
         if rng.random() < 0.6
         else tinted(rng.uniform(0.05, 0.1), 0.5, rng.uniform(0.4, 0.7), 0.3, "wood")
     )
-    for wall in walls:
-        parts.append(_painted_box(wall.box((0, wall.length), (0, 0.015), (0, 0.08)), trim))
+    parts += [_painted_box(wall.box((0, wall.length), (0, 0.015), (0, 0.08)), trim) for wall in walls]
     for opening in openings:
         draw = _door if opening.kind == "door" else _window
         parts.extend(draw(walls[opening.wall], opening, trim, rng))
@@ -239,9 +238,9 @@ def _window(wall: Wall, opening: Opening, trim: Paint, rng: np.random.Generator)
         _painted_box(wall.box(opening.s, (0, 0.01), opening.z), sky),
         _painted_box(wall.box((s0 - 0.08, s1 + 0.08), (0, 0.14), (z0 - 0.04, z0)), trim),
     ]
-    for middle in np.linspace(s0, s1, bars + 1)[1:-1]:
-        parts.append(_painted_box(wall.box((middle - 0.025, middle + 0.025), (0, 0.035), (z0, z1)), trim))
-    return parts
+    middles = np.linspace(s0, s1, bars + 1)[1:-1]
+    mullions = [wall.box((middle - 0.025, middle + 0.025), (0, 0.035), (z0, z1)) for middle in middles]
+    return parts + [_painted_box(mullion, trim) for mullion in mullions]
 
 
 def _pictures(

@@ -77,8 +77,8 @@ def make_scene(settings: RoomSettings, rng: np.random.Generator) -> Scene:
             return scene
     (a, b), (c, d) = settings.room_size
     raise ConfigError(
-        f"no room of {a}-{b} m by {c}-{d} m was found that holds {settings.min_objects} to {settings.max_objects} "
-        "objects in view of the camera; ask for fewer objects or larger rooms"
+        f"no room of {a}-{b} m by {c}-{d} m was found that shows the camera {settings.min_objects} to "
+        f"{settings.max_objects} objects; ask for fewer objects or larger rooms"
     )
 
 
@@ -97,7 +97,7 @@ def _furnished(settings: RoomSettings, pool: ModelPool, rng: np.random.Generator
 
 
 def _filmed(settings: RoomSettings, layout: Layout, rng: np.random.Generator) -> Scene | None:
-    """Walk through the room; take out what the camera does not see often enough. None if too little remains."""
+    """Walk through the room and take out what is not seen often enough; None if too little remains."""
     paints = [_paint_object(placed, rng) for placed in layout.objects]
     renderer = _make_renderer(layout.room, layout.objects, paints)
     cameras, missed = plan_path(
@@ -119,7 +119,7 @@ def _filmed(settings: RoomSettings, layout: Layout, rng: np.random.Generator) ->
         renderer = _make_renderer(layout.room, objects, [paints[i] for i in kept])
     else:
         objects = tuple(layout.objects)
-    renderer.expose(cameras[:: max(1, len(cameras) // 6)], brightness=rng.uniform(0.2, 0.3))
+    renderer.expose(cameras[:: max(1, len(cameras) // 6)], brightness=rng.uniform(0.35, 0.55))
     return Scene(layout.room, objects, tuple(cameras), renderer, _draw_scan_frame(layout.room, rng))
 
 

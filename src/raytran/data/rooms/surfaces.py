@@ -86,5 +86,5 @@ def box_triangles(lower: ArrayLike, upper: ArrayLike) -> NDArray[np.float64]:
 
 
 def quad_triangles(corners: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the two triangles ``(2, 3, 3)`` of a flat quadrilateral ``(4, 3)`` given in order round its rim."""
+    """Return two triangles ``(2, 3, 3)`` that fill a flat quadrilateral ``(4, 3)`` given round its rim."""
     return corners[np.array([[0, 1, 2], [0, 2, 3]])]

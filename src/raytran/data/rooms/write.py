@@ -72,8 +72,8 @@ def write_text(path: Path, text: str) -> None:
 def annotate(scene: Scene, *, scan_id: str, rng: np.random.Generator) -> dict[str, Any]:
     """Return a scene's entry of Scan2CAD's ``full_annotations.json``.
 
-    Scan2CAD's world is y-up: the scan is turned by -90 degrees about x and shifted, and CAD models are placed in
-    that world.
+    Scan2CAD's world is y-up: the scan is turned by -90 degrees about x and shifted, and CAD models are placed
+    in that world.
     """
     world_from_scan = np.eye(4)
     world_from_scan[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
@@ -112,7 +112,7 @@ def _trs(pose: NDArray[np.float64], scale: NDArray[np.float64]) -> dict[str, lis
 
 
 def _write_frames(scene: Scene, folder: Path, rng: np.random.Generator) -> int:
-    """Write pictures and poses, with two or three frames whose pose was lost; return how many frames there are."""
+    """Write pictures and poses, two or three of the poses lost; return how many frames there are."""
     height, width = scene.cameras[0].image_size
     grain = rng.standard_normal((height + 32, width + 32, 3), dtype=np.float32) * np.float32(
         rng.uniform(1.0, 3.0)
@@ -146,7 +146,7 @@ def _matrix_text(matrix: NDArray[np.float64]) -> str:
 
 
 def _write_scan_facts(scene: Scene, folder: Path, scan_id: str, count: int) -> None:
-    """Write the intrinsics and ``<scan>.txt``, whose ``axisAlignment`` sets the room straight, centred on its floor."""
+    """Write the intrinsics and ``<scan>.txt``, whose ``axisAlignment`` sets the room straight."""
     camera = scene.cameras[0]
     height, width = camera.image_size
     intrinsics = np.eye(4)
