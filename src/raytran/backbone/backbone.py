@@ -115,7 +115,7 @@ class Backbone(nn.Module):
         return self.voxel_position(position_code(at_origin.voxel_centers(), grid.extent, self.channels))
 
     def _locate_rays(self, cameras: Cameras, grid: VoxelGrid, size: Sequence[int]) -> Tensor:
-        """Return the embedding ``(n, h, w, C)`` of each cell's centre ray: origin and direction in the grid."""
+        """Return the embedding ``(n, h, w, C)`` of the origin and direction, in the grid, of cells' rays."""
         origin, direction = cameras.cell_rays((size[0], size[1]))
         origin = origin[..., 0, :] - grid.center[:, None, None, None]
         direction = torch.nn.functional.normalize(direction[..., 0, :], dim=-1)
