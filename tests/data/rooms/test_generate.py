@@ -43,6 +43,7 @@ def test_layout_on_disk(made):
             assert (folder / "model_normalized.obj").is_file()
 
 
+@pytest.mark.slow
 def test_same_bytes_from_two_processes(made, tmp_path):
     root, _ = made
     generate_rooms(tmp_path, num_train=2, num_val=1, processes=2, **SMALL)

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import logging
 import multiprocessing
 import os
 import shutil
@@ -13,8 +12,9 @@ import signal
 import time
 from collections import Counter
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,6 @@ from raytran.errors import ConfigError, DataError
 FORMAT = "raytran.rooms/1"
 """Rises when the same seed no longer gives the same rooms."""
 
-_log = logging.getLogger(__name__)
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -69,8 +68,8 @@ def generate_rooms(
 ) -> RoomsReport:
     """Make a data set of furnished rooms, or finish one that was begun.
 
-    Each scene follows from ``seed`` and its number alone. A scan whose folder carries its final name is
-    finished; calling again makes what is missing. An interrupt leaves nothing half-written.
+    Each scene follows from ``seed`` and its number alone. A scan whose folder carries its final name is done;
+    calling again makes what is missing. An interrupt lets rooms in work end and leaves nothing half-written.
 
     Args:
         output: folder that gets ``scannet/``, ``shapenet/``, ``scan2cad/`` and ``rooms.json``.
@@ -164,15 +163,15 @@ def _make_all(
                 bar.advance(task)
             return
         with _one_thread_each(), _pool(workers) as pool:
-            futures = [pool.submit(make_room_scan, output, settings, number) for number in numbers]
-            try:
-                for future in as_completed(futures):
+            # No more is handed out than is worked on, so that an interrupt waits for rooms in work only.
+            waiting = iter(numbers)
+            running = {pool.submit(make_room_scan, output, settings, n) for n in islice(waiting, workers)}
+            while running:
+                done, running = wait(running, return_when=FIRST_COMPLETED)
+                for future in done:
                     future.result()
                     bar.advance(task)
-            except BaseException:
-                _log.info("finishing the rooms in work")
-                pool.shutdown(wait=True, cancel_futures=True)
-                raise
+                    running |= {pool.submit(make_room_scan, output, settings, n) for n in islice(waiting, 1)}
 
 
 def _pool(workers: int) -> ProcessPoolExecutor:

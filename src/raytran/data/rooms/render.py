@@ -186,13 +186,16 @@ class Renderer:
 
     def _received(self, source: Light, point: Floats, normal: Floats, corner: NDArray[np.int_]) -> Floats:
         """Return the light ``(n, 3)`` that points receive from one source."""
-        target = np.repeat(source.position[None], 4, axis=0)
+        target = source.position.astype(np.float32)
         if source.shadows:
-            target[:, :2] += _CORNERS * source.half_side
-        away = target.astype(np.float32)[corner] - point
+            target = np.repeat(target[None], 4, axis=0)
+            target[:, :2] += (_CORNERS * source.half_side).astype(np.float32)
+            target = target[corner]
+        away = target - point
         square = _dot(away, away)
         cosine = np.maximum(_dot(normal, away), 0)
-        emitted = np.maximum(-_dot(away, np.broadcast_to(source.direction.astype(np.float32), away.shape)), 0)
+        x, y, z = (-source.direction).astype(np.float32)
+        emitted = np.maximum(away[:, 0] * x + away[:, 1] * y + away[:, 2] * z, 0)
         # Lamps shine sideways too: their fall-off with the angle is softened; a window's is a cosine.
         spread = 0.35 * np.sqrt(square) + 0.65 * emitted if source.shadows else emitted
         strength = cosine * spread / np.maximum(square, 0.3) ** 2

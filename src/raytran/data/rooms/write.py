@@ -51,6 +51,10 @@ def write_scene(scene: Scene, *, scan_id: str, root: Path, rng: np.random.Genera
         count = _write_frames(scene, folder, rng)
         _write_scan_facts(scene, folder, scan_id, count)
         os.replace(folder, scans / scan_id)
+    except OSError:
+        # Another process may have finished the same scan, of the same bytes, meanwhile.
+        if not (scans / scan_id).is_dir():
+            raise
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return len(scene.objects)
