@@ -31,6 +31,8 @@ from raytran.training.datamodule import SceneDataModule
 _log = logging.getLogger(__name__)
 
 _RECORD = "demo.json"
+_RECORDED = ("preset", "seed", "model", "loss", "optimizer", "views", "rooms", "schedule")
+"""Settings that a demo must share with the one it continues."""
 
 
 @dataclass(frozen=True)
@@ -83,11 +85,14 @@ def _data(overrides: Sequence[str], output: Path) -> SceneDataModule:
     """
     settings = ["experiment=stage2", "data.val_views=${views.predict_views}", f"output_dir={_quoted(output)}"]
     cfg = compose("train", [*overrides, *settings])
-    # Settings are compared as JSON writes them, in which there are no tuples.
-    wanted = json.loads(json.dumps(plain(cfg)))
+    wanted = {
+        name: value if isinstance(value := cfg[name], str | int) else plain(value) for name in _RECORDED
+    }
     path = output / _RECORD
     if path.is_file() and json.loads(path.read_text()) != wanted:
-        raise ConfigError(f"{output} holds a demo with other settings: delete it or choose another output")
+        raise ConfigError(
+            f"{output} holds a demo with other settings: delete it or give output=ANOTHER_FOLDER"
+        )
     output.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.part")
     temporary.write_text(json.dumps(wanted, indent=1) + "\n")

@@ -106,10 +106,10 @@ def write_page(
 def _summary(metrics: Mapping[str, Mapping[str, Any]]) -> str:
     counts = {split: metrics[split]["scan2cad"]["n_scenes"] for split in SPLITS}
     return (
-        f"Rooms were generated, a small network was trained from scratch on {counts['train']} of them through "
-        "the three stages of the paper, and then asked for the objects of these and of "
-        f"{counts['val']} rooms it has never seen: class, position, size, heading and mesh, from posed colour "
-        "frames alone."
+        f"Rooms were generated, a small network was trained from scratch on {counts['train']} of them "
+        "through the three stages of the paper, and then asked for the objects of these and of "
+        f"{counts['val']} rooms it has never seen: class, position, size, heading and mesh, from posed "
+        "colour frames alone."
     )
 
 
@@ -118,8 +118,8 @@ def _scores(split: str, metrics: Mapping[str, Mapping[str, Any]]) -> SplitScores
     meaning = {
         "train": "The network was trained on these very rooms. High numbers prove that the whole chain "
         "learns, from pixels to boxes and meshes; they say nothing about other rooms.",
-        "val": f"The network has never seen these rooms. {rooms} rooms cannot teach what furniture looks like "
-        "in general, so low numbers are expected; many more rooms and steps are needed to generalise.",
+        "val": f"The network has never seen these rooms. {rooms} rooms cannot teach what furniture looks "
+        "like in general, so low numbers are expected; many more rooms and steps are needed to generalise.",
     }
     per_class = metrics[split]["scan2cad"]["per_class"]
     return SplitScores(
@@ -136,7 +136,8 @@ def _show(scene: ShownScene, pictures: Path) -> Section:
     batch, prediction = scene.batch, scene.prediction
     folder = pictures / scene.prediction.scene_id
     folder.mkdir(exist_ok=True)
-    overlays = [Image.open(path) for path in sorted((scene.folder / "overlays").iterdir())]
+    in_order = dict.fromkeys(scene.folder / "overlays" / f"{name}.jpg" for name in batch.frame_id[0])
+    overlays = [Image.open(path) for path in in_order if path.is_file()]
     shown = [
         Picture(
             scene.folder / "topdown.png", "From above. Filled: predicted; dashed: true; arrow heads: fronts."

@@ -51,7 +51,7 @@ def draw_overlays(
     """
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
-    for n in choose_even(len(frame_ids), min(count, len(frame_ids))).tolist():
+    for n in dict.fromkeys(choose_even(len(frame_ids), min(count, len(frame_ids))).tolist()):
         frame = frame_image(views, n)
         camera = Cameras(views.intrinsics[0, n], views.world_from_camera[0, n], views.image_size)
         if frame.height < min_height:
