@@ -82,8 +82,9 @@ def train(cfg: DictConfig) -> FitResult:
     began = time.monotonic()
     try:
         trainer.fit(module, data, ckpt_path=resume_from)
-    except SIGTERMException as stop:
-        raise SystemExit(143) from stop
+    except SystemExit as stop:
+        # Lightning turns Ctrl-C and SIGTERM into exits; the shell shall see which it was.
+        raise SystemExit(143 if isinstance(stop, SIGTERMException) else 130) from stop
     seconds = time.monotonic() - began
     if trainer.is_global_zero:
         write_finished(
@@ -181,8 +182,8 @@ def _describe_run(cfg: DictConfig, folder: Path) -> None:
 
 
 def _quiet() -> None:
-    """Silence what Lightning tells everybody at every start, what is so on purpose here, and ranks but the first."""
-    if rank_zero_only.rank != 0:
+    """Silence Lightning's advice where we decided on purpose, and all ranks but the first."""
+    if getattr(rank_zero_only, "rank", 0) != 0:
         logging.getLogger("raytran").setLevel(logging.WARNING)
     for name in ("lightning.pytorch", "lightning.fabric"):
         logger = logging.getLogger(name)

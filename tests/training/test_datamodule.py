@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from collections import Counter
+
+from raytran.training.datamodule import EpochSampler, SceneDataModule
+
+
+class Scenes:
+    """Stands in for a data set: an item says when it was asked for what."""
+
+    def __init__(self, **options):
+        self.options = options
+        self.epoch = 0
+
+    def __len__(self):
+        return 5
+
+    def set_epoch(self, epoch):
+        self.epoch = epoch
+
+    def __getitem__(self, index):
+        return self.epoch, index
+
+
+def make_data(monkeypatch, tmp_path, **options):
+    monkeypatch.setattr("raytran.training.datamodule.collate_scenes", lambda samples: list(samples))
+    return SceneDataModule(
+        root=tmp_path, dataset=Scenes, targets=["objects"], num_views=7, val_views=9, num_workers=0, **options
+    )
+
+
+def test_every_epoch_brings_every_scene_in_another_order(monkeypatch, tmp_path):
+    loader = make_data(monkeypatch, tmp_path).train_dataloader()
+    orders = []
+    for epoch in range(3):
+        loader.sampler.set_epoch(epoch)
+        items = [item for batch in loader for item in batch]
+        assert {found for found, _ in items} == {epoch}
+        orders.append([index for _, index in items])
+    assert all(sorted(order) == [0, 1, 2, 3, 4] for order in orders)
+    assert len({tuple(order) for order in orders}) > 1
+
+
+def test_training_draws_views_and_validation_spreads_them(monkeypatch, tmp_path):
+    data = make_data(monkeypatch, tmp_path)
+    training, validation = data.split("train", training=True).options, data.split("val").options
+    assert (training["split"], training["view_choice"], training["num_views"]) == ("train", "random", 7)
+    assert (validation["split"], validation["view_choice"], validation["num_views"]) == ("val", "even", 9)
+
+
+def test_ranks_share_the_scenes():
+    parts = [list(EpochSampler(Scenes(), num_replicas=2, rank=rank)) for rank in range(2)]
+    counts = Counter(index for part in parts for _, index in part)
+    # Six places for five scenes: one comes twice so that both ranks take the same number of steps.
+    assert sorted(counts) == [0, 1, 2, 3, 4]
+    assert sum(counts.values()) == 6
+
+
+def test_data_are_made_where_they_are_read(monkeypatch, tmp_path):
+    made = []
+    make_data(monkeypatch, tmp_path, make=lambda output: made.append(output)).prepare_data()
+    assert made == [tmp_path]

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+from dataclasses import replace
+
+import lightning.pytorch as pl
+import pytest
+import torch
+
+from raytran.training.callbacks.stage_setup import StageSetup
+from raytran.types import ObjectSet
+
+
+def fit(module, batch, **settings):
+    trainer = pl.Trainer(
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        callbacks=[StageSetup()],
+        **settings,
+    )
+    loader = torch.utils.data.DataLoader([batch], batch_size=None)
+    trainer.fit(module, loader, loader)
+    return trainer
+
+
+def test_terms_and_scores_are_logged_by_split_and_task(batch, make_module):
+    logged = fit(make_module("stage2"), batch, max_steps=1).logged_metrics
+    for name in (
+        "train/total",
+        "train/objects/center",
+        "train/objects/class/layer0",
+        "val/objects/yaw",
+        "val/foreground",
+    ):
+        assert torch.isfinite(logged[name]), name
+    for name in (
+        "val/objects/accuracy_global",
+        "val/objects/f1_0.5",
+        "val/occupancy/iou",
+        "val/foreground/iou",
+    ):
+        assert 0 <= logged[name] <= 1, name
+
+
+def test_training_lowers_the_loss(batch, make_module):
+    module = make_module("stage2")
+    first = fit(module, batch, max_steps=1).logged_metrics["val/total"]
+    last = fit(module, batch, max_steps=25).logged_metrics["val/total"]
+    assert last < 0.8 * first
+
+
+@pytest.mark.parametrize("experiment", ["stage2", "stage3"])
+def test_a_scene_without_objects_trains(experiment, batch, make_module):
+    empty = replace(ObjectSet.empty(), shape=torch.zeros(0, 63, 63, 63, dtype=torch.bool))
+    trainer = fit(make_module(experiment), replace(batch, objects=(empty,)), max_steps=1)
+    assert torch.isfinite(trainer.logged_metrics["train/total"])

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import lightning.pytorch as pl
+import pytest
+import torch
+
+from raytran.errors import ConfigError
+from raytran.training.callbacks.stage_setup import StageSetup
+
+# What RayTran §4 trains in each stage, by the beginnings of parameter names.
+TRAINED = {
+    "stage1": ("backbone.", "heads.occupancy."),
+    "stage2": ("backbone.", "heads.occupancy.", "heads.foreground.", "heads.objects."),
+    "stage3": ("heads.shape.",),
+}
+# In stage 1 nothing reads the pixels after the last block (of two), so its pixel stream cannot learn.
+UNREACHED = {"stage1": ("backbone.blocks.1.pixel_stream.", "backbone.pixel_norm.")}
+
+
+def fit(module, batch, steps=2):
+    """Fit for a few steps; Lightning calls ``train()`` before and after the validation in between."""
+    trainer = pl.Trainer(
+        accelerator="cpu",
+        max_steps=steps,
+        limit_val_batches=1,
+        val_check_interval=1,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        callbacks=[StageSetup()],
+    )
+    loader = torch.utils.data.DataLoader([batch], batch_size=None)
+    trainer.fit(module, loader, loader)
+    return trainer
+
+
+@pytest.mark.parametrize("experiment", ["stage1", "stage2", "stage3"])
+def test_a_step_reaches_what_the_stage_trains_and_nothing_else(experiment, batch, make_module):
+    module = make_module(experiment)
+    module.stage.freeze(module.model)
+    raw = module.model(batch.views, tasks=module.stage.tasks, grid_center=batch.grid_center)
+    losses = module.loss(raw, batch, terms=module.stage.terms, decode_shapes=module.model.decode_shapes)
+    losses["total"].backward()
+    for name, parameter in module.model.named_parameters():
+        expected = name.startswith(TRAINED[experiment]) and not name.startswith(
+            UNREACHED.get(experiment, ("-",))
+        )
+        assert parameter.requires_grad == expected, name
+        assert (parameter.grad is not None) == expected, name
+
+
+@pytest.mark.parametrize("experiment", ["stage1", "stage2", "stage3"])
+def test_a_fit_moves_what_the_stage_trains_and_nothing_else(experiment, batch, make_module):
+    module = make_module(experiment)
+    before = copy.deepcopy(module.model.state_dict())
+    fit(module, batch)
+    after = module.model.state_dict()
+    moved = {name for name in before if not torch.equal(before[name], after[name])}
+    assert moved
+    assert all(name.startswith(TRAINED[experiment]) for name in moved)
+    statistics = {name for name in moved if "running_" in name or "num_batches" in name}
+    # Batch-norm statistics follow the images while the backbone trains, and stand still in stage 3.
+    assert bool(statistics) == (experiment != "stage3")
+
+
+def test_frozen_parts_stay_in_evaluation_mode(batch, make_module):
+    module = make_module("stage3")
+    modes = []
+
+    class Watch(pl.Callback):
+        def on_train_batch_start(self, trainer, pl_module, *_):
+            modes.append({name: part.training for name, part in pl_module.model.named_modules()})
+
+    trainer = pl.Trainer(
+        accelerator="cpu",
+        max_steps=3,
+        val_check_interval=1,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        callbacks=[StageSetup(), Watch()],
+    )
+    loader = torch.utils.data.DataLoader([batch], batch_size=None)
+    trainer.fit(module, loader, loader)
+    module.train()
+    modes.append({name: part.training for name, part in module.model.named_modules()})
+    assert len(modes) == 4
+    for mode in modes:
+        assert mode["heads.shape"]
+        assert mode["heads.shape.grow.0"]
+        assert not any(
+            training for name, training in mode.items() if name.startswith(("backbone", "heads.objects"))
+        )
+
+
+def test_an_unknown_part_is_an_error(make_module):
+    module = make_module("stage1")
+    stage = replace(module.stage, trainable=["backbone", "heads.colour"])
+    with pytest.raises(ConfigError, match=r"stage occupancy trains 'heads\.colour'"):
+        stage.freeze(module.model)
