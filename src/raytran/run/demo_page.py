@@ -106,10 +106,9 @@ def write_page(
 def _summary(metrics: Mapping[str, Mapping[str, Any]]) -> str:
     counts = {split: metrics[split]["scan2cad"]["n_scenes"] for split in SPLITS}
     return (
-        f"Rooms were generated, a small network was trained from scratch on {counts['train']} of them "
-        "through the three stages of the paper, and then asked for the objects of these and of "
-        f"{counts['val']} rooms it has never seen: class, position, size, heading and mesh, from posed "
-        "colour frames alone."
+        "Rooms were generated, a small network was trained from scratch through the three stages of the "
+        f"paper, and then asked for the objects of the {counts['train']} training rooms and of "
+        f"{counts['val']} held-out ones: class, position, size, heading and mesh, from posed colour frames alone."
     )
 
 
@@ -118,8 +117,8 @@ def _scores(split: str, metrics: Mapping[str, Mapping[str, Any]]) -> SplitScores
     meaning = {
         "train": "The network was trained on these very rooms. High numbers prove that the whole chain "
         "learns, from pixels to boxes and meshes; they say nothing about other rooms.",
-        "val": f"The network has never seen these rooms. {rooms} rooms cannot teach what furniture looks "
-        "like in general, so low numbers are expected; many more rooms and steps are needed to generalise.",
+        "val": f"The network has never seen these rooms. So few training rooms (here {rooms}) cannot teach "
+        "what furniture looks like in general, so low numbers are expected; many more are needed for that.",
     }
     per_class = metrics[split]["scan2cad"]["per_class"]
     return SplitScores(

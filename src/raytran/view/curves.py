@@ -46,7 +46,8 @@ def draw_curves(path: Path, stages: Mapping[str, History], *, prefix: str = "tra
         axes.grid(color="#e6e9ee", linewidth=0.6)
         axes.spines[:].set_color("#c9cfd8")
         if axes.lines:
-            axes.legend(frameon=False, fontsize=8, labelcolor=INK, ncols=2, loc="upper right")
+            below = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.16), "ncols": 3}
+            axes.legend(frameon=False, fontsize=8, labelcolor=INK, **below)
     figure.savefig(path)
     return path
 

@@ -146,7 +146,7 @@ def _write_name(
     width, height = size
     if low[0] >= width or low[1] >= height or high[0] <= 0 or high[1] <= 0:
         return
-    text, type_face = f"{CLASSES[label]} {score:.2f}", font(max(11, height // 36))
+    text, type_face = f"{CLASSES[label]} {score:.2f}", font(max(13, height // 26))
     left, top, right, bottom = pen.textbbox((0, 0), text, font=type_face)
     middle = (max(low[0], 0) + min(high[0], width)) / 2
     x = float(np.clip(middle - (right - left) / 2, 2, max(width - (right - left) - 4, 2)))

@@ -65,7 +65,7 @@ def draw_topdown(
     axes.set_title(title or f"{prediction.scene_id}: {count}", loc="left", color=INK, fontsize=13)
     present = set(objects.label.tolist()) | (set() if truth is None else set(truth.label.tolist()))
     _legend(axes, sorted(present), with_truth=truth is not None)
-    figure.savefig(path, bbox_inches="tight")
+    figure.savefig(path, bbox_inches="tight", pad_inches=0.15)
     return path
 
 
