@@ -72,11 +72,12 @@ class Renderer:
         edges = surfaces.triangles[:, 1:] - surfaces.triangles[:, :1]
         normals = np.cross(edges[:, 0], edges[:, 1])
         length = np.linalg.norm(normals, axis=1, keepdims=True)
-        self._normals: Floats = (normals / np.maximum(length, 1e-12)).astype(np.float32)
+        normals = (normals / np.maximum(length, 1e-12)).astype(np.float32)
+        self._normals: Floats = np.ascontiguousarray(normals.T)
         # Colours are given as displayed; light adds up in linear values (gamma 2).
-        self._dark: Floats = surfaces.dark**2
-        self._range: Floats = surfaces.light**2 - self._dark
-        self._axis = np.abs(self._normals).argmax(axis=1).astype(np.int32)
+        self._dark: Floats = np.ascontiguousarray(surfaces.dark.T**2)
+        self._range: Floats = np.ascontiguousarray(surfaces.light.T**2) - self._dark
+        self._axis = np.abs(normals).argmax(axis=1).astype(np.int8)
         self._patch = self._number_patches()
         self.exposure = 1.0
 
@@ -101,7 +102,7 @@ class Renderer:
         means = []
         for camera in cameras:
             rays = camera.pixel_rays(max(1, camera.image_size[0] // 24))
-            color, _, lamp = self._shade(camera, rays, np.arange(len(rays)) & 3)
+            color, lamp, _ = self._shade(camera, rays, np.arange(len(rays)) & 3)
             means.append(float((color + lamp).mean()))
         self.exposure = brightness / max(float(np.mean(means)), 1e-3)
 
@@ -114,20 +115,17 @@ class Renderer:
         """
         height, width = camera.image_size
         row, column = np.divmod(np.arange(height * width), width)
-        rays = camera.pixel_rays()
-        color, patch, lit = self._shade(camera, rays, (row & 1) * 2 + (column & 1))
+        color, lamp, patch = self._shade(camera, camera.pixel_rays(), (row & 1) * 2 + (column & 1))
+        color, lamp = (channels.reshape(3, height, width) for channels in (color, lamp))
         patches = patch.reshape(height, width)
-        edges = _edges(patches)
-        color = color.reshape(height, width, 3)
-        picture = self._display(_soften(color, lit.reshape(height, width, 3), patches))
-        r, c = np.nonzero(edges)
+        picture = self._display(_soften(color, lamp, patches))
+        r, c = np.nonzero(_edges(patches))
         u = (c[:, None] + _SUBPIXELS[:, 0]).ravel().astype(np.float32)
         v = (r[:, None] + _SUBPIXELS[:, 1]).ravel().astype(np.float32)
-        fine, _, fine_lit = self._shade(camera, camera.directions(u, v), np.tile(np.arange(4), len(r)))
-        picture[r, c] = self._display(fine + fine_lit).reshape(-1, 4, 3).mean(axis=1)
-        picture *= 255.0
-        picture += noise
-        return np.clip(picture + 0.5, 0, 255, out=picture).astype(np.uint8)
+        color, lamp, _ = self._shade(camera, camera.directions(u, v), np.tile(np.arange(4), len(r)))
+        picture[:, r, c] = self._display(color + lamp).reshape(3, -1, 4).mean(axis=2)
+        values = np.moveaxis(picture, 0, -1) * np.float32(255) + noise
+        return np.clip(values + np.float32(0.5), 0, 255).astype(np.uint8)
 
     def _display(self, color: Floats) -> Floats:
         """Turn linear light into display values in [0, 1]: a soft shoulder, then gamma 2."""
@@ -136,7 +134,7 @@ class Renderer:
 
     def _shade(
         self, camera: Pinhole, rays: Floats, corner: NDArray[np.int_]
-    ) -> tuple[Floats, NDArray[np.int32], Floats]:
+    ) -> tuple[Floats, Floats, NDArray[np.int32]]:
         """Cast and shade rays.
 
         Args:
@@ -145,75 +143,82 @@ class Renderer:
             corner: ``(n,)`` which quarter of a lamp the shadow ray aims at.
 
         Returns:
-            light but for the lamp that casts shadows ``(n, 3)``, patch seen ``(n,)``, that lamp's ``(n, 3)``.
+            colour without the light of lamps that cast shadows ``(3, n)``, what these add ``(3, n)``, and the
+            patch seen ``(n,)``.
         """
         eye = camera.room_from_camera[:3, 3].astype(np.float32)
         hit = self._scene.run(np.ascontiguousarray(np.broadcast_to(eye, rays.shape)), rays, output=1)
         prim = np.maximum(hit["primID"], 0)
-        depth = np.where(hit["primID"] < 0, np.float32(1.0), hit["tfar"])
-        normal = self._normals[prim]
-        facing = _dot(normal, rays)
-        normal = normal * np.where(facing > 0, np.float32(-1), np.float32(1))[:, None]
-        point = eye + rays * depth[:, None]
-        distance = depth * np.sqrt(_dot(rays, rays))
-        slant = np.maximum(np.abs(facing) * depth / distance, 0.1)
-        footprint = depth / np.float32(camera.intrinsics[0, 0]) / np.sqrt(slant)
-        albedo = self._albedo(prim, point, footprint)
-        sky = _AMBIENT * (0.85 + 0.15 * normal[:, 2])
-        light = np.repeat(sky[:, None], 3, axis=1).astype(np.float32)
+        depth = np.where(hit["primID"] < 0, np.float32(1), hit["tfar"])
+        # From here on vectors are (3, n): whole rows are read and written.
+        ray = np.ascontiguousarray(rays.T)
+        normal = np.take(self._normals, prim, axis=1)
+        facing = _dot(normal, ray)
+        normal *= -np.sign(facing)
+        point = ray * depth
+        point += eye[:, None]
+        slant = np.maximum(np.abs(facing) / np.sqrt(_dot(ray, ray)), np.float32(0.1))
+        pixel = np.float32(1 / camera.intrinsics[0, 0])
+        footprint = (depth * pixel / np.sqrt(slant)).astype(np.float32)
+        light = np.empty_like(point)
+        light[:] = _AMBIENT * (0.85 + 0.15 * normal[2])
         lamp = np.zeros_like(light)
         for source in self._lights:
-            received = self._received(source, point, normal, corner)
-            if source.shadows:
-                lamp += received
-            else:
-                light += received
-        emissive = self._surfaces.emissive[prim]
-        light[emissive] = 1.6 / np.float32(self.exposure)
-        lamp[emissive] = 0
-        return albedo * light, self._patch[prim], albedo * lamp
+            strength = self._strength(source, point, normal, corner)
+            target = lamp if source.shadows else light
+            for channel in range(3):
+                target[channel] += strength * np.float32(source.color[channel])
+        emissive = np.nonzero(self._surfaces.emissive[prim])[0]
+        light[:, emissive] = 1.6 / np.float32(self.exposure)
+        lamp[:, emissive] = 0
+        albedo = self._albedo(prim, point, footprint)
+        light *= albedo
+        lamp *= albedo
+        return light, lamp, self._patch[prim]
 
     def _albedo(self, prim: NDArray[np.int32], point: Floats, footprint: Floats) -> Floats:
-        """Return linear colours ``(n, 3)``; textures lie along the two axes most parallel to the surface."""
+        """Return linear colours ``(3, n)``; textures lie along the two axes most parallel to the surface."""
         axis = self._axis[prim]
-        u = np.where(axis == 0, point[:, 1], point[:, 0])
-        v = np.where(axis == 2, point[:, 1], point[:, 2])
-        grey = self._textures.sample(self._surfaces.texture[prim], u, v, footprint)
-        color = self._range[prim]
-        color *= grey[:, None]
-        color += self._dark[prim]
+        u = np.where(axis == 0, point[1], point[0])
+        v = np.where(axis == 2, point[1], point[2])
+        color = np.take(self._range, prim, axis=1)
+        color *= self._textures.sample(self._surfaces.texture[prim], u, v, footprint)
+        color += np.take(self._dark, prim, axis=1)
         return color
 
-    def _received(self, source: Light, point: Floats, normal: Floats, corner: NDArray[np.int_]) -> Floats:
-        """Return the light ``(n, 3)`` that points receive from one source."""
-        target = source.position.astype(np.float32)
-        if source.shadows:
-            target = np.repeat(target[None], 4, axis=0)
-            target[:, :2] += (_CORNERS * source.half_side).astype(np.float32)
-            target = target[corner]
-        away = target - point
+    def _strength(self, source: Light, point: Floats, normal: Floats, corner: NDArray[np.int_]) -> Floats:
+        """Return how strongly ``(n,)`` one source lights points ``(3, n)``."""
+        quarter = np.zeros((3, 4))
+        quarter[:2] = _CORNERS.T * source.half_side
+        target = (source.position[:, None] + quarter).astype(np.float32)
+        away = (np.take(target, corner, axis=1) if source.shadows else target[:, :1]) - point
         square = _dot(away, away)
-        cosine = np.maximum(_dot(normal, away), 0)
+        near = np.maximum(square, np.float32(0.3))
         x, y, z = (-source.direction).astype(np.float32)
-        emitted = np.maximum(away[:, 0] * x + away[:, 1] * y + away[:, 2] * z, 0)
-        # Lamps shine sideways too: their fall-off with the angle is softened; a window's is a cosine.
-        spread = 0.35 * np.sqrt(square) + 0.65 * emitted if source.shadows else emitted
-        strength = cosine * spread / np.maximum(square, 0.3) ** 2
-        if source.shadows:
-            strength *= 2.0 * np.maximum(square, 0.3) ** 0.25
-            lit = np.nonzero(strength > 1e-4)[0]
-            start = point[lit] + normal[lit] * np.float32(_SHADOW_OFFSET)
-            limit = np.full(len(lit), 0.97, dtype=np.float32)
-            blocked = self._scene.run(start, np.ascontiguousarray(away[lit]), dists=limit, query="OCCLUDED")
-            strength[lit[blocked >= 0]] = 0
-        return strength[:, None] * source.color.astype(np.float32)
+        emitted = np.maximum(away[0] * x + away[1] * y + away[2] * z, 0)
+        strength = np.maximum(_dot(normal, away), 0) / (near * near)
+        if not source.shadows:
+            return strength * emitted
+        # Lamps shine sideways too and reach farther than a point would: walls throw their light back.
+        strength *= (0.7 * np.sqrt(square) + 1.3 * emitted) * np.sqrt(np.sqrt(near))
+        lit = np.nonzero(strength > 1e-4)[0]
+        toward = np.take(away, lit, axis=1)
+        start = np.take(point, lit, axis=1) + np.take(normal, lit, axis=1) * np.float32(_SHADOW_OFFSET)
+        blocked = self._scene.run(
+            np.ascontiguousarray(start.T),
+            np.ascontiguousarray(toward.T),
+            dists=np.full(len(lit), 0.97, dtype=np.float32),
+            query="OCCLUDED",
+        )
+        strength[lit[blocked >= 0]] = 0
+        return strength
 
     def _number_patches(self) -> NDArray[np.int32]:
         """Number the sets of triangles between which no edge shows: equal owner and colour, like normals."""
         keys = np.column_stack(
             [
                 self._surfaces.owner,
-                np.round(self._normals * 2.5),
+                np.round(self._normals.T * 2.5),
                 np.round(self._surfaces.light * 255),
                 self._surfaces.texture,
             ]
@@ -226,7 +231,7 @@ class Renderer:
 
 
 def _dot(a: Floats, b: Floats) -> Floats:
-    return a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def _edges(patches: NDArray[np.int32]) -> NDArray[np.bool_]:
@@ -248,8 +253,8 @@ def _soften(color: Floats, lamp: Floats, patches: NDArray[np.int32]) -> Floats:
     """
     same = (patches[1:, 1:] == patches[:-1, 1:]) & (patches[1:, 1:] == patches[1:, :-1])
     same &= patches[1:, 1:] == patches[:-1, :-1]
-    rows = lamp[1:] + lamp[:-1]
-    mean = (rows[:, 1:] + rows[:, :-1]) * np.float32(0.25)
-    total = color + lamp
-    total[1:, 1:][same] = (color[1:, 1:] + mean)[same]
-    return total
+    rows = lamp[:, 1:] + lamp[:, :-1]
+    mean = (rows[:, :, 1:] + rows[:, :, :-1]) * np.float32(0.25)
+    chosen = lamp.copy()
+    np.copyto(chosen[:, 1:, 1:], mean, where=same)
+    return color + chosen
