@@ -108,7 +108,7 @@ def _summary(metrics: Mapping[str, Mapping[str, Any]]) -> str:
     return (
         "Rooms were generated, a small network was trained from scratch through the three stages of the "
         f"paper, and then asked for the objects of the {counts['train']} training rooms and of "
-        f"{counts['val']} held-out ones: class, position, size, heading and mesh, from posed colour frames alone."
+        f"{counts['val']} held-out ones: class, position, size, heading and mesh, from posed frames alone."
     )
 
 
