@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The commands that train and evaluate, on generated rooms."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import torch
+
+import raytran
+from raytran.errors import CheckpointError, ConfigError
+from raytran.run.curriculum import run_curriculum
+from raytran.run.entry import compose
+from raytran.run.folders import LAST, read_finished
+from raytran.run.loggers import read_history
+from raytran.run.train import train
+
+
+@pytest.fixture(scope="module")
+def trained(settings, tmp_path_factory):
+    """The folder of a finished curriculum and its results."""
+    folder = tmp_path_factory.mktemp("curriculum")
+    return folder, run_curriculum(settings, output_dir=folder)
+
+
+def fit(settings, folder, *more):
+    return train(compose("train", [*settings, f"output_dir={folder}", *more]))
+
+
+def same_weights(a, b, prefix=""):
+    state_a, state_b = (torch.load(path, weights_only=True)["state_dict"] for path in (a, b))
+    return {name for name in state_a if name.startswith(prefix) and torch.equal(state_a[name], state_b[name])}
+
+
+def test_a_curriculum_trains_three_stages(trained):
+    folder, fits = trained
+    assert [fit.folder.name for fit in fits] == ["stage1", "stage2", "stage3"]
+    stages = [read_finished(fit.folder) for fit in fits]
+    assert [(mark.stage, mark.preset, mark.steps) for mark in stages] == [
+        ("occupancy", "tiny", 4),
+        ("joint", "tiny", 4),
+        ("shape", "tiny", 4),
+    ]
+    cards = [torch.load(fit.checkpoint, weights_only=True) for fit in fits]
+    assert [card["parent"] for card in cards] == [None, str(fits[0].checkpoint), str(fits[1].checkpoint)]
+    assert read_finished(folder).stage == "curriculum"
+
+
+def test_a_stage_starts_from_its_parent_and_keeps_what_is_frozen(trained):
+    _, fits = trained
+    names = set(torch.load(fits[1].checkpoint, weights_only=True)["state_dict"])
+    kept = same_weights(fits[1].checkpoint, fits[2].checkpoint)
+    assert kept == {name for name in names if not name.startswith("model.heads.shape.")}
+    # Stage 2 does not train the shape head: it is still that of stage 1.
+    assert same_weights(fits[0].checkpoint, fits[1].checkpoint, "model.heads.shape.")
+
+
+def test_a_finished_curriculum_is_not_trained_again(trained, settings):
+    folder, fits = trained
+    before = [fit.checkpoint.stat().st_mtime_ns for fit in fits]
+    again = run_curriculum(settings, output_dir=folder)
+    assert [fit.checkpoint.stat().st_mtime_ns for fit in again] == before
+    assert [fit.seconds for fit in again] == [0, 0, 0]
+
+
+def test_a_curriculum_with_other_settings_is_not_continued(trained, settings):
+    with pytest.raises(ConfigError, match="resume=none to start a new one"):
+        run_curriculum([*settings, "seed=3"], output_dir=trained[0])
+    with pytest.raises(ConfigError, match=r"stages=\["):
+        run_curriculum([*settings, "experiment=stage2"], output_dir=trained[0])
+
+
+def test_a_killed_curriculum_goes_on_where_it_was(trained, settings, tmp_path):
+    folder = tmp_path / "curriculum"
+    shutil.copytree(trained[0], folder)
+    for gone in ("finished.json", "stage2/finished.json"):
+        (folder / gone).unlink()
+    shutil.rmtree(folder / "stage3")
+    before = (folder / "stage1" / LAST).stat().st_mtime_ns
+    fits = run_curriculum(settings, output_dir=folder)
+    assert fits[0].checkpoint.stat().st_mtime_ns == before
+    assert [read_finished(fit.folder).steps for fit in fits] == [4, 4, 4]
+    # Stage 2 had taken its four steps: resumed, it logs no further one.
+    assert len(read_history(fits[1].folder)["train/total"]) == 4
+    assert torch.load(fits[2].checkpoint, weights_only=True)["parent"] == str(fits[1].checkpoint)
+
+
+def test_curves_can_be_read(trained):
+    history = read_history(trained[1][1].folder)
+    assert [step for step, _ in history["train/objects/center"]] == [0, 1, 2, 3]
+    assert len(history["val/objects/accuracy_global"]) == 2
+
+
+def test_a_run_describes_itself(trained):
+    folder = trained[1][0].folder
+    assert "learning_rate: 0.001" in (folder / "config.yaml").read_text()
+    assert json.loads((folder / "provenance.json").read_text())["versions"]["torch"] == torch.__version__
+
+
+def test_a_trained_model_is_loaded_and_predicts(trained, rooms):
+    from raytran.data.scannet import load_views
+
+    model = raytran.load(trained[1][2].checkpoint)
+    scan = sorted((rooms / "scannet" / "scans").iterdir())[0]
+    views, _ = load_views(scan, image_size=(64, 64), num_views=3)
+    prediction = model.predict(views)
+    assert len(prediction.objects) == 8
+    assert prediction.objects.shape.shape == (8, 63, 63, 63)
+
+
+def test_resume_continues_in_the_same_folder(settings, tmp_path):
+    folder = tmp_path / "run"
+    straight = fit(settings, tmp_path / "straight", "trainer.max_steps=6")
+    fit(settings, folder)
+    (folder / "finished.json").unlink()
+    resumed = fit(settings, folder, "trainer.max_steps=6", "resume=auto")
+    assert (straight.steps, resumed.steps) == (6, 6)
+    assert [step for step, _ in read_history(folder)["train/total"]] == [0, 1, 2, 3, 4, 5]
+    content = torch.load(resumed.checkpoint, weights_only=True)
+    assert content["lr_schedulers"][0]["last_epoch"] == 6
+    assert next(iter(content["optimizer_states"][0]["state"].values()))["step"] == 6
+
+
+def test_a_run_is_not_overwritten(settings, trained):
+    with pytest.raises(ConfigError, match="holds a run already"):
+        fit(settings, trained[1][0].folder)
+
+
+def test_a_run_is_not_continued_as_another_stage(settings, trained, tmp_path):
+    target = tmp_path / "run" / LAST
+    target.parent.mkdir(parents=True)
+    target.write_bytes(trained[1][0].checkpoint.read_bytes())
+    with pytest.raises(CheckpointError, match="is of stage occupancy, not joint"):
+        fit(settings, tmp_path / "run", "experiment=stage2", "resume=auto")
+
+
+def test_init_from_auto_takes_the_newest_parent(settings, trained, tmp_path):
+    outputs = tmp_path / "outputs"
+    with pytest.raises(ConfigError, match=r"`python -m raytran\.train experiment=stage1 preset=tiny` first"):
+        fit(settings, outputs / "tiny" / "stage2" / "a", "experiment=stage2", f"outputs={outputs}")
+    parent = fit(settings, outputs / "tiny" / "stage1" / "a", f"outputs={outputs}")
+    child = fit(settings, outputs / "tiny" / "stage2" / "b", "experiment=stage2", f"outputs={outputs}")
+    assert torch.load(child.checkpoint, weights_only=True)["parent"] == str(parent.checkpoint)
+
+
+def test_a_missing_parent_is_one_sentence(settings, tmp_path):
+    with pytest.raises(CheckpointError, match=r"no checkpoint at .*none\.ckpt"):
+        fit(settings, tmp_path / "run", "experiment=stage2", f"init_from={tmp_path / 'none.ckpt'}")
+
+
+def test_a_parent_cut_in_half_is_one_sentence_and_exit_code_1(settings, trained, tmp_path, command):
+    cut = tmp_path / "cut.ckpt"
+    content = trained[1][0].checkpoint.read_bytes()
+    cut.write_bytes(content[: len(content) // 2])
+    done = command("train", *settings, "experiment=stage2", f"init_from={cut}", folder=tmp_path)
+    assert done.returncode == 1
+    assert done.stderr.startswith("raytran: cannot read")
+    assert "damaged or cut short" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_evaluate_writes_numbers(trained, rooms, tmp_path, command):
+    checkpoint = trained[1][2].checkpoint
+    done = command(
+        "evaluate", f"checkpoint={checkpoint}", f"data.root={rooms}", "output=results", folder=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    metrics = json.loads((tmp_path / "results" / "metrics.json").read_text())
+    assert metrics["scan2cad"]["n_scenes"] == 1
+    with (tmp_path / "results" / "per_object.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == metrics["scan2cad"]["n_total"]
+    assert set(metrics["box_f1"]["per_threshold"]) == {"0.25", "0.5"}
+    assert 0 <= metrics["occupancy_iou"] <= 1
+    assert 0 <= metrics["foreground_iou"] <= 1
+    assert sorted(path.name for path in (tmp_path / "results").iterdir()) == [
+        "metrics.json",
+        "per_object.csv",
+        "per_scene.csv",
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("stop", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_stopped_run_goes_on(stop, code, settings, tmp_path, command):
+    long = [*settings, "trainer.max_steps=400", "checkpoint_every=100000", "trainer.val_check_interval=1000"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "raytran.train", *long],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    ) as process:
+        deadline = time.monotonic() + 120
+        while not (log := next(tmp_path.glob("outputs/tiny/stage1/*/logs/version_0"), None)):
+            assert process.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        time.sleep(3)
+        process.send_signal(stop)
+        assert process.wait(timeout=60) == code
+    run = log.parent.parent
+    step = torch.load(run / LAST, weights_only=True)["global_step"]
+    assert 0 < step < 400
+    last = f"trainer.max_steps={step + 2}"
+    done = command("train", *long, last, "resume=auto", folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert read_finished(run).steps == step + 2
+    assert [folder.name for folder in run.parent.iterdir()] == [run.name]
+
+
+@pytest.mark.slow
+def test_two_processes_train_together(settings, trained, tmp_path, command):
+    parent = trained[1][0].checkpoint
+    run = tmp_path / "run"
+    arguments = [
+        *settings,
+        "trainer=ddp_cpu",
+        "experiment=stage2",
+        f"init_from={parent}",
+        f"output_dir={run}",
+    ]
+    done = command("train", *(a for a in arguments if a != "trainer=cpu"), folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert read_finished(run).steps == 4
+    assert not any(tmp_path.glob("outputs/**/last.ckpt"))
+    # Two rooms on two ranks are one step an epoch: the fourth step is in epoch 3, on one rank in epoch 1.
+    assert torch.load(run / LAST, weights_only=True)["epoch"] == 3

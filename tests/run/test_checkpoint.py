@@ -1,0 +1,89 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+import torch
+
+import raytran
+from raytran.errors import CheckpointError
+from raytran.run.build import build_model, plain
+from raytran.run.checkpoint import checkpoint_card, load_weights, prediction_settings
+from raytran.run.entry import compose
+from raytran.training.checkpoint_file import write_checkpoint
+
+
+@pytest.fixture
+def config():
+    return compose("train", ["preset=tiny", "model.grid_resolution=[8,8,4]", "output_dir=unused"])
+
+
+@pytest.fixture
+def saved(config, tmp_path):
+    """A checkpoint as training writes it, and the model in it."""
+    model = build_model(config)
+    card = checkpoint_card(
+        stage="joint",
+        preset="tiny",
+        model=plain(config.model),
+        views=plain(config.views),
+        parent="stage1.ckpt",
+    )
+    state = {f"model.{name}": value for name, value in model.state_dict().items()}
+    path = tmp_path / "last.ckpt"
+    write_checkpoint(path, {**card, "state_dict": state})
+    return path, model
+
+
+def test_load_rebuilds_the_model(saved):
+    path, model = saved
+    loaded = raytran.load(path)
+    assert not loaded.training
+    assert loaded.grid_resolution == (8, 8, 4)
+    state = loaded.state_dict()
+    assert all(torch.equal(value, state[name]) for name, value in model.state_dict().items())
+
+
+def test_the_card_is_complete(saved):
+    content = torch.load(saved[0], weights_only=True)
+    assert content["format"] == "raytran.checkpoint/1"
+    assert (content["stage"], content["preset"], content["parent"]) == ("joint", "tiny", "stage1.ckpt")
+    assert content["model"]["_target_"] == "raytran.model.RayTran"
+    assert content["versions"]["torch"] == torch.__version__
+    assert content["git_commit"] is None or len(content["git_commit"].split("+")[0]) == 40
+
+
+def test_settings_of_prediction(saved, config):
+    settings = prediction_settings(saved[0])
+    assert settings.image_size == tuple(config.views.image_size)
+    assert (settings.num_views, settings.preset) == (config.views.predict_views, "tiny")
+
+
+def test_a_cut_file_is_one_sentence(saved):
+    path = saved[0]
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(CheckpointError, match=r"last\.ckpt: the file is damaged or cut short"):
+        raytran.load(path)
+
+
+def test_weights_of_another_model_are_one_sentence(saved):
+    other = build_model(compose("train", ["preset=tiny", "model.backbone.channels=24", "output_dir=unused"]))
+    content = torch.load(saved[0], weights_only=True)
+    with pytest.raises(CheckpointError, match=r"preset tiny\) do not fit this model"):
+        load_weights(other, content, saved[0])
+
+
+def test_a_checkpoint_cannot_run_foreign_code(saved):
+    path = saved[0]
+    content = torch.load(path, weights_only=True)
+    content["model"]["backbone"]["resnet"] = {"_target_": "os.system", "command": "true"}
+    write_checkpoint(path, content)
+    with pytest.raises(CheckpointError, match=r"os\.system"):
+        raytran.load(path)
+
+
+def test_importing_the_package_is_light():
+    code = "import sys, raytran; raise SystemExit(any(name in sys.modules for name in ('torch', 'hydra')))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

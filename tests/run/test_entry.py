@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+from hydra.errors import InstantiationException
+from omegaconf import OmegaConf
+
+from raytran.errors import DataError
+from raytran.run.entry import compose, run_or_exit
+
+
+def run(*arguments, folder):
+    command = [sys.executable, "-m", *arguments]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+
+
+def raise_error(error):
+    def function(cfg):
+        raise error
+
+    return function
+
+
+def test_a_mistake_is_one_sentence_and_exit_code_1(capsys):
+    with pytest.raises(SystemExit) as stop:
+        run_or_exit(raise_error(DataError("no scan at scans/a: check the path")), OmegaConf.create())
+    assert stop.value.code == 1
+    assert capsys.readouterr().err == "raytran: no scan at scans/a: check the path\n"
+
+
+def test_a_mistake_inside_a_constructor_is_one_sentence(capsys):
+    wrapped = InstantiationException("Error in call to target")
+    wrapped.__cause__ = DataError("no file x")
+    with pytest.raises(SystemExit):
+        run_or_exit(raise_error(wrapped), OmegaConf.create())
+    assert capsys.readouterr().err == "raytran: no file x\n"
+
+
+def test_a_missing_setting_is_one_sentence(capsys):
+    with pytest.raises(SystemExit):
+        run_or_exit(lambda cfg: cfg.checkpoint, OmegaConf.create({"checkpoint": "???"}))
+    assert "checkpoint" in capsys.readouterr().err
+
+
+def test_a_defect_keeps_its_traceback():
+    with pytest.raises(ZeroDivisionError):
+        run_or_exit(lambda cfg: 1 / 0, OmegaConf.create())
+
+
+def test_an_unknown_setting_fails(tmp_path):
+    done = run("raytran.train", "preset=tiny", "learning_speed=3", folder=tmp_path)
+    assert done.returncode != 0
+    assert "learning_speed" in done.stderr
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("command", ["train", "curriculum", "evaluate", "prepare"])
+def test_help_names_the_settings_without_loading_torch(command, tmp_path):
+    code = (
+        "import runpy, sys; sys.argv = ['x', '--help'];"
+        f"runpy.run_module('raytran.{command}', run_name='__main__');"
+        "raise SystemExit('torch' in sys.modules)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert f"python -m raytran.{command}" in done.stdout
+    assert "preset" in done.stdout
+
+
+def test_compose_is_what_the_command_line_would_compose():
+    cfg = compose("train", ["preset=tiny", "experiment=stage2", "output_dir=x"])
+    assert (cfg.preset, cfg.stage.name, cfg.output_dir) == ("tiny", "joint", "x")

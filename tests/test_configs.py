@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Configs say what the code does: keys are arguments, arguments are keys, the paper is the default."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from datetime import timedelta
+
+import pytest
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from raytran.data.rooms.generate import generate_rooms
+from raytran.errors import ConfigError
+from raytran.run.build import build_model, plain
+from raytran.run.entry import compose
+from raytran.run.settings import RunConfig
+
+EXPERIMENTS = ("stage1", "stage2", "stage3")
+PRESETS = ("raytran", "small", "tiny")
+TRAINERS = ("auto", "cpu", "gpu", "ddp", "ddp_cpu")
+# Given by the code that instantiates the node, not by the config.
+GIVEN_BY_CODE = {
+    "raytran.data.dataset.scan2cad_dataset": {"root", "split", "num_views", "view_choice", "targets"},
+    "raytran.run.rooms.ensure_rooms": {"output"},
+}
+# Part of the layout that scan2cad_dataset stands for.
+FIXED_BY_LAYOUT = {"scans_root", "scene_ids", "annotations", "shapenet_root"}
+# Only a choice of a large signature is written out.
+PARTIAL = {
+    "lightning.pytorch.Trainer",
+    "lightning.pytorch.loggers.CSVLogger",
+}
+
+
+def train_config(*overrides):
+    return compose("train", [*overrides, "output_dir=unused"])
+
+
+def nodes_with_target(node):
+    if isinstance(node, dict):
+        if "_target_" in node:
+            yield node
+        for value in node.values():
+            yield from nodes_with_target(value)
+
+
+def locate(path):
+    module, name = path.rsplit(".", 1)
+    return getattr(importlib.import_module(module), name)
+
+
+def arguments(path):
+    """Return argument name → parameter, also of what a function passes its arguments on to."""
+    parameters = dict(inspect.signature(locate(path)).parameters)
+    if path == "raytran.data.dataset.scan2cad_dataset":
+        passed_on = dict(inspect.signature(locate("raytran.data.dataset.SceneDataset")).parameters)
+        parameters |= {name: value for name, value in passed_on.items() if name not in FIXED_BY_LAYOUT}
+        del parameters["options"]
+    if path == "raytran.run.rooms.ensure_rooms":
+        parameters = dict(inspect.signature(generate_rooms).parameters)
+    return parameters
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("data", [("data=rooms",), ("data=scan2cad", "data.root=somewhere")])
+def test_keys_are_arguments(preset, data):
+    config = plain(train_config(f"preset={preset}", *data))
+    nodes = list(nodes_with_target(config))
+    assert len(nodes) > 10
+    for node in nodes:
+        target = node["_target_"]
+        keys = {key for key in node if key not in ("_target_", "_partial_")}
+        known = set(arguments(target))
+        assert keys <= known, f"{target} has no argument {sorted(keys - known)}"
+        if target not in PARTIAL:
+            missing = known - keys - GIVEN_BY_CODE.get(target, set())
+            assert not missing, f"{target}: the config does not name {sorted(missing)}"
+
+
+@pytest.mark.parametrize("trainer", TRAINERS)
+def test_trainer_keys_are_arguments(trainer):
+    config = plain(train_config(f"trainer={trainer}").trainer)
+    assert set(config) - {"_target_"} <= set(arguments("lightning.pytorch.Trainer"))
+
+
+@pytest.mark.parametrize("trainer", ["ddp", "ddp_cpu"])
+def test_strategies_are_built(trainer):
+    strategy = instantiate(plain(train_config(f"trainer={trainer}").trainer.strategy))
+    # Other ranks wait while the first makes rooms; torch's default of half an hour would end that.
+    assert strategy._timeout == timedelta(hours=12)
+
+
+def test_the_papers_preset_is_the_default_of_the_code():
+    config = plain(train_config("preset=raytran"))
+    # Fetching weights is the preset's choice; a class must not reach for the network unasked.
+    config["model"]["backbone"]["resnet"]["weights"] = None
+    for group in ("model", "optimizer"):
+        for node in nodes_with_target(config[group]):
+            for name, parameter in arguments(node["_target_"]).items():
+                if parameter.default is not inspect.Parameter.empty:
+                    wanted = (
+                        list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
+                    )
+                    assert node[name] == wanted, f"{node['_target_']}.{name}"
+
+
+def test_the_papers_numbers():
+    config = train_config("preset=raytran", "trainer=ddp", "experiment=stage2")
+    assert [config.schedule[stage].steps for stage in ("occupancy", "joint", "shape")] == [
+        224000,
+        239000,
+        5000,
+    ]
+    assert config.optimizer.learning_rate == 1e-4
+    assert config.optimizer.weight_decay == 5e-2
+    assert config.trainer.gradient_clip_val == 0.1
+    assert config.trainer.precision == "16-mixed"
+    assert config.trainer.devices * config.data.batch_size == 8
+    assert list(config.views.image_size) == [480, 640]
+    assert (config.views.num_views, config.views.predict_views) == (20, 96)
+    assert list(config.model.grid_resolution) == [48, 48, 16]
+    assert config.model.heads.objects.num_queries == 64
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_experiment_resolves_with_every_preset(preset, experiment):
+    config = train_config(f"preset={preset}", f"experiment={experiment}")
+    OmegaConf.resolve(config)
+    assert (config.preset, config.experiment) == (preset, experiment)
+    assert config.trainer.max_steps == config.schedule[config.stage.name].steps
+    assert all(side % 16 == 0 for side in config.views.image_size)
+
+
+@pytest.mark.parametrize("preset", ["small", "tiny"])
+def test_small_networks_are_built(preset):
+    model = build_model(train_config(f"preset={preset}"))
+    assert set(model.heads) == {"occupancy", "foreground", "objects", "shape"}
+
+
+def test_one_word_chooses_a_preset_and_typing_wins():
+    config = train_config("preset=tiny", "model=small", "views.num_views=3")
+    assert config.model.backbone.resnet.width == 32
+    assert config.data.num_views == 3
+
+
+@pytest.mark.parametrize("root", ["train", "curriculum", "evaluate", "prepare"])
+def test_roots_resolve(root):
+    extra = {"evaluate": ["checkpoint=x.ckpt"], "prepare": ["output=x"]}.get(root, ["output_dir=x"])
+    OmegaConf.resolve(compose(root, ["preset=tiny", *extra]))
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("seed=many", "many"),
+        ("checkpoint_every=0", "at least 1"),
+        ("progress_bar=fancy", "choose one of rich, tqdm, none"),
+    ],
+)
+def test_switches_are_checked(override, message):
+    with pytest.raises(ConfigError, match=message):
+        RunConfig.read(train_config("preset=tiny", override))
+
+
+def test_switches_are_read():
+    run = RunConfig.read(train_config("preset=tiny", "experiment=stage3", "seed=5"))
+    assert (run.preset, run.experiment, run.seed, run.init_from, run.resume) == (
+        "tiny",
+        "stage3",
+        5,
+        "auto",
+        "none",
+    )
