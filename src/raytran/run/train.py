@@ -130,7 +130,7 @@ def _start(cfg: DictConfig, run: RunConfig) -> tuple[Reconstruction, Path | None
     if run.resume not in ("none", "auto"):
         raise CheckpointError(f"no checkpoint at {run.resume}: give the path of a last.ckpt, or resume=auto")
     if run.resume == "auto":
-        _log.info("nothing to continue: starting from the beginning")
+        _log.info("nothing to continue: this is a new run")
     parent = find_parent(run, _stage(cfg))
     module = build_module(cfg, build_model(cfg, pretrained=parent is None))
     if parent is None:
