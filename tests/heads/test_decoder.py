@@ -34,14 +34,14 @@ def test_windowed_attention_equals_its_formula(generator: torch.Generator) -> No
                 center, width = reference[scene, q] + window[head, :3], window[head, 3].exp()
                 distance = (place - center).square().sum(-1)
                 weight = (key @ query[head] / 2 - distance / (2 * width**2)).softmax(0)
-                read += [weight @ value, weight @ place - reference[scene, q]]
+                read += [weight @ value, 10 * (weight @ place - reference[scene, q])]  # decimetres
             expected[scene, q] = attention.output(torch.cat(read))
     torch.testing.assert_close(attention(queries, reference, memory, place), expected, atol=1e-5, rtol=1e-4)
 
 
-def test_windows_of_the_heads_begin_between_30_cm_and_2_m() -> None:
+def test_windows_of_the_heads_begin_between_30_cm_and_1_m() -> None:
     width = WindowedAttention(channels=8, num_heads=4).window.bias.view(4, 4)[:, 3].exp()
-    torch.testing.assert_close(width[[0, -1]], torch.tensor([0.3, 2.0]))
+    torch.testing.assert_close(width[[0, -1]], torch.tensor([0.3, 1.0]))
     assert bool((width.diff() > 0).all())
 
 

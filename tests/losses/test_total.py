@@ -46,7 +46,7 @@ def test_perfect_predictions_cost_nothing_in_every_layer(make_objects, make_perf
     losses = total_loss()(RawScene(torch.zeros(1, 3), objects=layers), batch(objects), terms=("objects",))
     names = [f"objects/{name}" for name in ("class", "center", "size", "yaw")]
     assert set(losses) == {*names, *(f"{name}/layer0" for name in names), "total"}
-    assert float(losses["total"]) == pytest.approx(0.0, abs=1e-5)
+    assert float(losses["total"].detach()) == pytest.approx(0.0, abs=1e-5)
 
 
 def test_pose_terms_are_means_over_objects(make_objects, make_perfect) -> None:

@@ -13,8 +13,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-WIDTHS = (0.3, 2.0)
+WIDTHS = (0.3, 1.0)
 """Widths (standard deviation, metres) of the narrowest and of the widest head's window before training."""
+
+UNIT = 0.1
+"""Metres in which relative positions are read; at this scale a decimetre counts as much as a feature does."""
 
 
 class DecoderLayer(nn.Module):
@@ -101,7 +104,7 @@ class WindowedAttention(nn.Module):
                 scale=1.0,
             )
             features, mean_position = attended[..., :-4], attended[..., -4:-1]
-            relative = mean_position - reference.float()[:, None]
+            relative = (mean_position - reference.float()[:, None]) / UNIT
             read = torch.cat([features, relative], dim=-1).transpose(1, 2).flatten(2)
         return self.output(read)
 

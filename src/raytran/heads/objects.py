@@ -15,6 +15,9 @@ from raytran.geometry.position import position_code
 from raytran.heads.decoder import DecoderLayer
 from raytran.types import CLASSES, RawObjects
 
+QUERY_SCALE = 0.1
+"""Standard deviation of the query embeddings before training: small, so that what they read outweighs it."""
+
 TYPICAL_SIZE = 0.7
 """Side of an object before training, metres."""
 
@@ -24,7 +27,7 @@ class ObjectHead(nn.Module):
 
     Every query is a learned embedding and a learned reference point in the volume. A layer predicts the
     centre as an offset from the reference point, and hands it on as the reference of the next layer
-    (Deformable DETR, Zhu et al., ICLR 2021).
+    (Deformable DETR, Zhu et al., ICLR 2021, but with gradients: early layers learn to aim for late ones).
 
     Args:
         channels: C of the voxel features and queries.
@@ -53,7 +56,7 @@ class ObjectHead(nn.Module):
         spread = SobolEngine(3).draw(num_queries + 1)[1:] - 0.5
         self.register_buffer("extent", extent, persistent=False)
         self.reference = nn.Parameter(0.8 * spread)
-        self.query = nn.Parameter(torch.randn(num_queries, channels))
+        self.query = nn.Parameter(QUERY_SCALE * torch.randn(num_queries, channels))
         self.position = nn.Linear(channels, channels)
         self.layers = nn.ModuleList(
             DecoderLayer(channels=channels, num_heads=num_heads, hidden=hidden) for _ in range(num_layers)
@@ -78,7 +81,7 @@ class ObjectHead(nn.Module):
         for layer, predictor in zip(self.layers, self.predictors, strict=True):
             queries = layer(queries, self._locate(reference), reference, memory, voxel_position)
             objects = predictor(queries, reference, grid_center)
-            reference = objects.center.detach() - grid_center[:, None]
+            reference = objects.center - grid_center[:, None]
             outputs.append(objects)
         return tuple(outputs)
 
