@@ -168,7 +168,7 @@ def test_does_not_depend_on_how_many_rays_are_traced_at_once(random_cameras, mon
     cameras = random_cameras(3, spread=1.0)
     grid = VoxelGrid((9, 8, 5), (4.0, 4.0, 2.0), torch.zeros(3))
     expected = trace_pairs(cameras, grid, (6, 8))
-    monkeypatch.setattr("raytran.ops.traverse._RAYS_AT_ONCE", {"cpu": 7})
+    monkeypatch.setattr("raytran.ops.traverse._AT_ONCE", {"cpu": 70})
     _assert_equal(trace_pairs(cameras, grid, (6, 8)), expected)
 
 

@@ -13,6 +13,8 @@ grid. A camera within ``NUDGE`` of a plane of the grid stands on it, so that rou
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
@@ -27,9 +29,25 @@ NUDGE = 1e-9
 _PARALLEL = 1e-12
 """Slopes below this, in voxels per metre of depth, count as zero."""
 
-_RAYS_AT_ONCE = {"cpu": 1 << 12}
-_RAYS_AT_ONCE_ELSEWHERE = 1 << 17
-"""Rays traced together: few enough on a CPU that the work stays in its cache."""
+_AT_ONCE = {"cpu": 1 << 18}
+_AT_ONCE_ELSEWHERE = 1 << 23
+"""Crossings looked at together: on a CPU so few that they stay in its cache."""
+
+
+class _Rays(NamedTuple):
+    """Rays in voxel coordinates and voxels per metre of depth.
+
+    Attributes:
+        origin: ``(3, R)``.
+        direction: ``(3, R)``.
+        first: ``(R,)`` depth at which the ray enters the grid, at least 0.
+        last: ``(R,)`` depth at which it leaves; not behind ``first``: it misses the grid.
+    """
+
+    origin: Tensor
+    direction: Tensor
+    first: Tensor
+    last: Tensor
 
 
 @torch.no_grad()
@@ -52,33 +70,28 @@ def trace_pairs(
     Raises:
         ShapeError: cameras and grid have other leading shapes.
     """
-    origins, directions = _rays_in_grid(cameras, grid, feature_size, rays_per_cell)
-    scenes, views = directions.shape[:2]
-    num_pixels = scenes * views * feature_size[0] * feature_size[1]
+    rays, scenes = _rays_in_grid(cameras, grid, feature_size, rays_per_cell)
     rays_per_pixel = rays_per_cell**2
-    origins, directions = origins.expand_as(directions).reshape(-1, 3), directions.reshape(-1, 3)
-
-    at_once = _RAYS_AT_ONCE.get(directions.device.type, _RAYS_AT_ONCE_ELSEWHERE)
-    step = max(1, at_once // rays_per_pixel)
-    pixel_index, voxel_index = [], []
-    for first in range(0, num_pixels, step):
-        chunk = slice(first * rays_per_pixel, (first + step) * rays_per_pixel)
-        key = _trace(
-            origins[chunk].T.contiguous(), directions[chunk].T.contiguous(), grid.resolution, rays_per_pixel
-        )
-        pixel = key.div(grid.num_voxels, rounding_mode="floor")
-        voxel_index.append((key - pixel * grid.num_voxels).long())
-        pixel_index.append(pixel.long() + first)
-    pixels, voxels = torch.cat(pixel_index), torch.cat(voxel_index)
+    num_pixels = rays.first.shape[0] // rays_per_pixel
+    at_once = _AT_ONCE.get(rays.first.device.type, _AT_ONCE_ELSEWHERE) // max(grid.resolution)
+    pixels_at_once = max(1, at_once // rays_per_pixel)
+    keys = []
+    for pixel in range(0, num_pixels, pixels_at_once):
+        chunk = slice(pixel * rays_per_pixel, (pixel + pixels_at_once) * rays_per_pixel)
+        key = _trace(_Rays(*(part[..., chunk] for part in rays)), grid.resolution, rays_per_pixel)
+        keys.append(key.long() + pixel * grid.num_voxels)
+    key = torch.cat(keys)
+    pixel_index = key.div(grid.num_voxels, rounding_mode="floor")
+    voxel_index = key - pixel_index * grid.num_voxels
     if scenes > 1:
-        voxels += pixels.div(num_pixels // scenes, rounding_mode="floor") * grid.num_voxels
-    return PairList(pixels, voxels, num_pixels=num_pixels, num_voxels=scenes * grid.num_voxels)
+        voxel_index += pixel_index.div(num_pixels // scenes, rounding_mode="floor") * grid.num_voxels
+    return PairList(pixel_index, voxel_index, num_pixels, scenes * grid.num_voxels)
 
 
 def _rays_in_grid(
     cameras: Cameras, grid: VoxelGrid, feature_size: tuple[int, int], rays_per_cell: int
-) -> tuple[Tensor, Tensor]:
-    """Return origins ``(B, N, 1, 3)`` and directions ``(B, N, rays of a view, 3)`` in voxel coordinates."""
+) -> tuple[_Rays, int]:
+    """Return the rays of all pixels, those of a pixel one after another, and the number of scenes."""
     lead, scenes = cameras.intrinsics.shape[:-2], grid.center.shape[:-1]
     if len(lead) not in (1, 2) or (scenes != () and scenes != lead[:-1]):
         raise ShapeError(
@@ -86,41 +99,20 @@ def _rays_in_grid(
             f"got {tuple(lead)} and {tuple(grid.center.shape)}"
         )
     precise = Cameras(cameras.intrinsics.double(), cameras.world_from_camera.double(), cameras.image_size)
-    _, directions = precise.cell_rays(feature_size, rays_per_cell)
-    grid = VoxelGrid(grid.resolution, grid.extent, grid.center.double().to(directions.device))
-    origins = grid.voxel_from_world(precise.position)[..., None, :]
-    directions = (directions / grid.voxel_size).flatten(-4, -2)
-    origins = torch.where((origins - origins.round()).abs() < NUDGE, origins.round(), origins)
-    directions = directions.masked_fill_(directions.abs() < _PARALLEL, 0.0)
-    return (origins[None], directions[None]) if len(lead) == 1 else (origins, directions)
-
-
-def _trace(
-    origin: Tensor, direction: Tensor, resolution: tuple[int, int, int], rays_per_pixel: int
-) -> Tensor:
-    """Return ``pixel · num_voxels + voxel`` of the pairs of some pixels, sorted, each once.
-
-    Args:
-        origin: ``(3, R)`` in voxel coordinates.
-        direction: ``(3, R)`` in voxels per metre of depth; the rays of a pixel follow one another.
-        resolution: ``(X, Y, Z)``.
-        rays_per_pixel: how many rays that is.
-    """
-    num_voxels = resolution[0] * resolution[1] * resolution[2]
-    pixel = torch.arange(origin.shape[1] // rays_per_pixel, dtype=origin.dtype, device=origin.device)
-    base = pixel.repeat_interleave(rays_per_pixel) * num_voxels
-    first, last = _clip(origin, direction, resolution)
-    found = [(base + _start(origin, direction, resolution))[(first == 0) & (last > NUDGE)]]
-    for axis in range(3):
-        depth, voxel = _entered(axis, origin, direction, resolution)
-        found.append(voxel.add_(base)[(depth > first) & (depth < last)])
-    wide = num_voxels * origin.shape[1] >= 2**31
-    keys = torch.cat(found).to(torch.int64 if wide else torch.int32)
-    return torch.unique_consecutive(keys.sort().values)
+    _, direction = precise.cell_rays(feature_size, rays_per_cell)
+    grid = VoxelGrid(grid.resolution, grid.extent, grid.center.double().to(direction.device))
+    direction = (direction / grid.voxel_size).flatten(-4, -2)
+    direction = direction.masked_fill_(direction.abs() < _PARALLEL, 0.0)
+    origin = grid.voxel_from_world(precise.position)[..., None, :]
+    origin = torch.where((origin - origin.round()).abs() < NUDGE, origin.round(), origin)
+    origin, direction = (
+        part.reshape(-1, 3).T.contiguous() for part in (origin.expand_as(direction), direction)
+    )
+    return _Rays(origin, direction, *_clip(origin, direction, grid.resolution)), lead[:-1].numel()
 
 
 def _clip(origin: Tensor, direction: Tensor, resolution: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
-    """Return the depths at which rays enter (≥ 0) and leave the grid, ``(R,)`` each; leave ≤ enter: miss."""
+    """Return at which depths rays enter and leave the grid: ``_Rays.first`` and ``_Rays.last``."""
     size = torch.tensor(resolution, dtype=origin.dtype, device=origin.device)[:, None]
     lower, upper = -origin / direction, (size - origin) / direction
     parallel, inside = direction == 0, (origin >= 0) & (origin < size)
@@ -129,29 +121,41 @@ def _clip(origin: Tensor, direction: Tensor, resolution: tuple[int, int, int]) -
     return near.amax(0).clamp_(min=0), far.amin(0)
 
 
-def _start(origin: Tensor, direction: Tensor, resolution: tuple[int, int, int]) -> Tensor:
+def _trace(rays: _Rays, resolution: tuple[int, int, int], rays_per_pixel: int) -> Tensor:
+    """Return ``pixel · num_voxels + voxel`` of some pixels' pairs, sorted, each once; pixels count from 0."""
+    num_rays, num_voxels = rays.first.shape[0], resolution[0] * resolution[1] * resolution[2]
+    pixel = torch.arange(num_rays // rays_per_pixel, dtype=rays.first.dtype, device=rays.first.device)
+    base = pixel.repeat_interleave(rays_per_pixel).mul_(num_voxels)
+    found = [(_start(rays, resolution) + base)[(rays.first == 0) & (rays.last > NUDGE)]]
+    for axis in range(3):
+        depth, voxel = _entered(rays, axis, resolution)
+        found.append(voxel.add_(base)[(depth > rays.first) & (depth < rays.last)])
+    key = torch.cat(found).to(torch.int32 if num_rays * num_voxels < 2**31 else torch.int64)
+    return torch.unique_consecutive(key.sort().values)
+
+
+def _start(rays: _Rays, resolution: tuple[int, int, int]) -> Tensor:
     """Return the voxel in which each ray begins, ``(R,)``; without meaning for cameras outside the grid."""
-    index = torch.where(direction < 0, origin.ceil() - 1, origin.floor())
+    index = torch.where(rays.direction < 0, rays.origin.ceil() - 1, rays.origin.floor())
     return (index[0] * resolution[1] + index[1]) * resolution[2] + index[2]
 
 
-def _entered(
-    axis: int, origin: Tensor, direction: Tensor, resolution: tuple[int, int, int]
-) -> tuple[Tensor, Tensor]:
-    """Return the voxels that each ray enters across one axis and a depth just behind the crossing.
+def _entered(rays: _Rays, axis: int, resolution: tuple[int, int, int]) -> tuple[Tensor, Tensor]:
+    """Return the voxels that each ray enters across one axis, and a depth just behind each crossing.
 
     Both are ``(n, R)`` for the ``n`` cells along the axis: into cell i a ray comes through the plane i, or
     i + 1 if it runs backwards. Outside the grid they have no meaning.
     """
+    origin, direction = rays.origin, rays.direction
     strides = (resolution[1] * resolution[2], resolution[2], 1)
     cell = torch.arange(resolution[axis], dtype=origin.dtype, device=origin.device)[:, None]
-    slope = 1 / direction[axis]
+    slope = direction[axis].reciprocal()
     backwards = (direction[axis] < 0).to(origin.dtype)
     depth = torch.addcmul((backwards - origin[axis]) * slope + NUDGE, cell, slope)
-    voxel = (cell * strides[axis]).expand_as(depth)
+    voxel = cell * strides[axis]
     for other in range(3):
         if other != axis:
             index = torch.addcmul(origin[other], direction[other], depth).floor_()
             # A crossing that counts is inside the grid; rounding must not say otherwise.
-            voxel = voxel + index.clamp_(0, resolution[other] - 1).mul_(strides[other])
+            voxel = torch.add(voxel, index.clamp_(0, resolution[other] - 1), alpha=strides[other])
     return depth, voxel
