@@ -8,6 +8,7 @@ result (§3.2): what is occupied, what is foreground in each view, and which obj
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
@@ -15,9 +16,9 @@ from torch import Tensor, nn
 from raytran.backbone.backbone import STRIDE, Backbone
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.geometry.rotation import rotation_from_yaw
+from raytran.heads.slots import objects_of_slots
 from raytran.ops.traverse import trace_pairs
-from raytran.types import PADDING, ObjectSet, RawObjects, RawScene, ScenePrediction, Views
+from raytran.types import ObjectSet, RawScene, ScenePrediction, Views
 
 TASKS = ("occupancy", "foreground", "objects")
 """What ``forward`` can be asked for; shapes are decoded afterwards, for chosen queries only."""
@@ -122,41 +123,22 @@ class RayTran(nn.Module):
         with_shapes: bool = True,
     ) -> tuple[ScenePrediction, ...]:
         """Turn raw predictions of B scenes into objects, masks and occupancy; arguments as in ``predict``."""
-        predictions = []
-        for scene, scene_id in enumerate(scene_ids):
-            objects = ObjectSet.empty().to(raw.grid_center.device)
-            if raw.objects is not None:
-                objects = self._decode_objects(raw.objects[-1], scene, score_threshold, with_shapes)
-            predictions.append(
-                ScenePrediction(
-                    scene_id=scene_id,
-                    objects=objects,
-                    grid_center=raw.grid_center[scene],
-                    occupancy=None if raw.occupancy is None else raw.occupancy[scene].float().sigmoid(),
-                    foreground=None if raw.foreground is None else raw.foreground[scene].float().sigmoid(),
-                )
+        return tuple(
+            ScenePrediction(
+                scene_id=scene_id,
+                objects=self._objects(raw, scene, score_threshold, with_shapes),
+                grid_center=raw.grid_center[scene],
+                occupancy=None if raw.occupancy is None else raw.occupancy[scene].float().sigmoid(),
+                foreground=None if raw.foreground is None else raw.foreground[scene].float().sigmoid(),
             )
-        return tuple(predictions)
-
-    def _decode_objects(
-        self, raw: RawObjects, scene: int, score_threshold: float, with_shapes: bool
-    ) -> ObjectSet:
-        """Return the best class of each slot that is no padding, highest score first."""
-        probability = raw.class_logits[scene].softmax(dim=-1)[:, :PADDING]
-        score, label = probability.max(dim=-1)
-        order = score.argsort(descending=True, stable=True)
-        order = order[score[order] >= score_threshold]
-        sin, cos = raw.yaw_vector[scene, order].unbind(dim=-1)
-        shape = None
-        if with_shapes and "shape" in self.heads:
-            chunks = raw.embedding[scene, order].split(SHAPES_AT_ONCE)
-            shape = torch.cat([self.decode_shapes(chunk).float().sigmoid() for chunk in chunks])
-        return ObjectSet(
-            label=label[order],
-            center=raw.center[scene, order],
-            size=raw.log_size[scene, order].exp(),
-            rotation=rotation_from_yaw(torch.atan2(sin, cos)),
-            symmetry=torch.ones_like(label[order]),
-            score=score[order],
-            shape=shape,
+            for scene, scene_id in enumerate(scene_ids)
         )
+
+    def _objects(self, raw: RawScene, scene: int, score_threshold: float, with_shapes: bool) -> ObjectSet:
+        if raw.objects is None:
+            return ObjectSet.empty().to(raw.grid_center.device)
+        objects, embedding = objects_of_slots(raw.objects[-1], scene, score_threshold=score_threshold)
+        if not with_shapes or "shape" not in self.heads:
+            return objects
+        chunks = [self.decode_shapes(chunk) for chunk in embedding.split(SHAPES_AT_ONCE)]
+        return replace(objects, shape=torch.cat(chunks).float().sigmoid())
