@@ -67,9 +67,7 @@ def scene_occupancy(objects: ObjectSet, grid: VoxelGrid) -> Tensor:
         for shape, size, rotation, center in zip(
             objects.shape, objects.size, objects.rotation, objects.center, strict=True
         ):
-            index = _voxels_of(shape, size, rotation, center, grid)
-            inside = ((index >= 0) & (index < torch.tensor(grid.resolution))).all(dim=-1)
-            occupied[grid.flat_index(index[inside])] = True
+            occupied[_voxels_of(shape, size, rotation, center, grid)] = True
     return occupied.reshape(grid.resolution)
 
 
@@ -137,13 +135,18 @@ def _place(unit_mesh: tuple[NDArray, NDArray], objects: ObjectSet, m: int) -> tu
 
 
 def _voxels_of(shape: Tensor, size: Tensor, rotation: Tensor, center: Tensor, grid: VoxelGrid) -> Tensor:
-    """Return the voxels ``(n, 3)``, some outside the grid, of points that fill an object's solid cells."""
+    """Return the numbers of the voxels, some many times, that points filling an object's solid cells lie in."""
     cell = size / shape.shape[0]
     spacing = float(grid.voxel_size.min()) / 2
     inner = torch.cartesian_prod(
         *((torch.arange(n) + 0.5) / n for n in (cell / spacing).ceil().int().tolist())
     )
-    points = (shape.nonzero()[:, None] + inner).reshape(-1, 3)
+    points = (shape.nonzero().T[:, :, None] + inner.T[:, None]).flatten(1)
     voxel_from_cell = rotation * cell / grid.voxel_size[:, None]
     origin = (center - rotation @ size / 2 - grid.lower) / grid.voxel_size
-    return torch.addmm(origin, points, voxel_from_cell.T).floor().long()
+    # One row per axis, in floating point up to the end: a few hundred thousand points for every object.
+    index = torch.addmm(origin[:, None], voxel_from_cell, points).floor_()
+    inside = index[0] >= 0
+    for axis, count in enumerate(grid.resolution):
+        inside &= (index[axis] >= 0) & (index[axis] < count)
+    return grid.flat_index(index[:, inside].T.long())
