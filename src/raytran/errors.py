@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The errors a user can meet, each one sentence that says what is wrong and what to do, and the shape check."""
+"""The errors a user can meet, one sentence each: what is wrong and what to do; and the shape check."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 
 
 class RaytranError(Exception):
-    """Base of all errors that are the user's to mend; entry points print it as one sentence and exit with 1."""
+    """Base of all errors that are the user's to mend; commands print it as one sentence and exit with 1."""
 
 
 class ConfigError(RaytranError):

@@ -116,7 +116,7 @@ class ObjectSet(Parcel):
         label: ``(M,)`` int64, index into ``CLASSES``.
         center: ``(M, 3)`` centre of the object's box, metres.
         size: ``(M, 3)`` full extents along the object's own axes (x width, y height, z depth), metres.
-        rotation: ``(M, 3, 3)`` world_from_object; of an upright object ``Rz(yaw) · B`` (``geometry.rotation``).
+        rotation: ``(M, 3, 3)`` world_from_object; if upright ``Rz(yaw) · B`` (``geometry.rotation``).
         symmetry: ``(M,)`` int64, number of equal turns about the object's up axis: 1, 2, 4, or
             ``SYMMETRY_INFINITE``. All ones for predictions.
         score: ``(M,)`` confidence in [0, 1]; ones for ground truth.

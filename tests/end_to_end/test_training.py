@@ -174,10 +174,10 @@ def test_evaluate_writes_numbers(trained, rooms, tmp_path, command):
     )
     assert done.returncode == 0, done.stderr
     metrics = json.loads((tmp_path / "results" / "metrics.json").read_text())
-    assert metrics["scan2cad"]["n_scenes"] == 1
+    assert metrics["strict"]["n_scenes"] == 1
     with (tmp_path / "results" / "per_object.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == metrics["scan2cad"]["n_total"]
-    assert set(metrics["box_f1"]["per_threshold"]) == {"0.25", "0.5"}
+        assert len(list(csv.DictReader(file))) == metrics["strict"]["n_total"]
+    assert set(metrics["strict"]["per_threshold"]) == {"0.25", "0.5"}
     assert 0 <= metrics["occupancy_iou"] <= 1
     assert 0 <= metrics["foreground_iou"] <= 1
     assert sorted(path.name for path in (tmp_path / "results").iterdir()) == [

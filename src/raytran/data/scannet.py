@@ -86,8 +86,6 @@ def read_scan(folder: Path) -> Scan:
             f"none of the {len(dropped)} frames in {folder} has an image and a valid pose: "
             "check that pose/<n>.txt holds finite 4x4 camera-to-world matrices named as color/<n>.jpg"
         )
-    if dropped:
-        _log.info("%s: dropped %d of %d frames", folder.name, len(dropped), len(dropped) + len(poses))
     header = _read_header(folder / f"{folder.name}.txt")
     image_size = stored_size([images[name] for name in poses])
     return Scan(
@@ -118,6 +116,10 @@ def load_views(folder: Path, *, image_size: tuple[int, int], num_views: int) -> 
         DataError: see ``read_scan``; or fewer than two images can be read.
     """
     scan = read_scan(folder)
+    if scan.dropped:
+        total = len(scan) + len(scan.dropped)
+        reasons = ", ".join(sorted(set(scan.dropped.values())))
+        _log.info("%s: dropped %d of %d frames (%s)", folder.name, len(scan.dropped), total, reasons)
     views, used = scan_views(scan, choose_even(len(scan), num_views).tolist(), image_size=image_size)
     return views, tuple(scan.frame_id[i] for i in used)
 

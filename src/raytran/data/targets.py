@@ -135,7 +135,7 @@ def _place(unit_mesh: tuple[NDArray, NDArray], objects: ObjectSet, m: int) -> tu
 
 
 def _voxels_of(shape: Tensor, size: Tensor, rotation: Tensor, center: Tensor, grid: VoxelGrid) -> Tensor:
-    """Return the numbers of the voxels, some many times, that points filling an object's solid cells lie in."""
+    """Return the number of the voxel of each point that fills an object's solid cells, inside the grid."""
     cell = size / shape.shape[0]
     spacing = float(grid.voxel_size.min()) / 2
     inner = torch.cartesian_prod(

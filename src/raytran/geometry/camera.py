@@ -73,10 +73,10 @@ class Cameras:
         height, width = feature_size
         scaled = self.scaled_to((height, width))
         n = rays_per_cell
-        like = {"dtype": self.intrinsics.dtype, "device": self.intrinsics.device}
-        part = (torch.arange(n, **like) + 0.5) / n
-        v = torch.arange(height, **like)[:, None, None, None] + part[:, None]
-        u = torch.arange(width, **like)[None, :, None, None] + part
+        dtype, device = self.intrinsics.dtype, self.intrinsics.device
+        part = (torch.arange(n, dtype=dtype, device=device) + 0.5) / n
+        v = torch.arange(height, dtype=dtype, device=device)[:, None, None, None] + part[:, None]
+        u = torch.arange(width, dtype=dtype, device=device)[None, :, None, None] + part
         v, u = torch.broadcast_tensors(v, u)
         image = torch.stack([u, v, torch.ones_like(u)], dim=-1).reshape(-1, 3)
         world_from_image = self.world_from_camera[..., :3, :3] @ torch.linalg.inv(scaled.intrinsics)

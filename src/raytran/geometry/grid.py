@@ -48,7 +48,7 @@ class VoxelGrid:
         return self.center - self._vector(self.extent) / 2
 
     def voxel_from_world(self, points: Tensor) -> Tensor:
-        """Return continuous voxel coordinates of world points, both ``(..., n, 3)``; cell i spans [i, i+1]."""
+        """Return continuous voxel coordinates of world points, both ``(..., n, 3)``; i spans [i, i+1]."""
         return (points - self.lower[..., None, :]) / self.voxel_size
 
     def world_from_voxel(self, coordinates: Tensor) -> Tensor:
@@ -57,7 +57,8 @@ class VoxelGrid:
 
     def voxel_centers(self) -> Tensor:
         """Return the centres of all voxels in the world, ``(..., X, Y, Z, 3)``."""
-        axes = [torch.arange(n, dtype=self.center.dtype, device=self.center.device) + 0.5 for n in self.resolution]
+        like = self.center
+        axes = [torch.arange(n, dtype=like.dtype, device=like.device) + 0.5 for n in self.resolution]
         index = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1).reshape(-1, 3)
         return self.world_from_voxel(index).unflatten(-2, self.resolution)
 

@@ -57,7 +57,7 @@ def wrap_angle(angle: Tensor) -> Tensor:
 
 
 def symmetric_yaw_error(predicted: Tensor, target: Tensor, symmetry: Tensor) -> Tensor:
-    """Return the smallest signed turn from ``target`` to ``predicted`` over the turns that leave the target equal.
+    """Return the smallest signed turn from ``target`` to ``predicted``, over the target's symmetries.
 
     Args:
         predicted: ``(...)`` radians.

@@ -45,10 +45,10 @@ class ShownScene:
 
 def headline(metrics: Mapping[str, Any]) -> dict[str, str]:
     """Return the numbers to put first, as text, from the content of a ``metrics.json``."""
-    accuracy = metrics["scan2cad"]
+    accuracy = metrics["strict"]
     numbers = {"accuracy": f"{accuracy['global_average']:.0%}"}
     numbers["objects"] = f"{accuracy['n_good']} of {accuracy['n_total']}"
-    for threshold, entry in metrics["box_f1"]["per_threshold"].items():
+    for threshold, entry in metrics["strict"]["per_threshold"].items():
         numbers[f"F1 at IoU {threshold}"] = f"{entry['f1']:.2f}"
     for task, name in (("occupancy", "occupancy IoU"), ("foreground", "mask IoU")):
         if f"{task}_iou" in metrics:
@@ -104,7 +104,7 @@ def write_page(
 
 
 def _summary(metrics: Mapping[str, Mapping[str, Any]]) -> str:
-    counts = {split: metrics[split]["scan2cad"]["n_scenes"] for split in SPLITS}
+    counts = {split: metrics[split]["strict"]["n_scenes"] for split in SPLITS}
     return (
         "Rooms were generated, a small network was trained from scratch through the three stages of the "
         f"paper, and then asked for the objects of the {counts['train']} training rooms and of "
@@ -113,14 +113,14 @@ def _summary(metrics: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 def _scores(split: str, metrics: Mapping[str, Mapping[str, Any]]) -> SplitScores:
-    rooms = metrics["train"]["scan2cad"]["n_scenes"]
+    rooms = metrics["train"]["strict"]["n_scenes"]
     meaning = {
         "train": "The network was trained on these very rooms. High numbers prove that the whole chain "
         "learns, from pixels to boxes and meshes; they say nothing about other rooms.",
         "val": f"The network has never seen these rooms. So few training rooms (here {rooms}) cannot teach "
         "what furniture looks like in general, so low numbers are expected; many more are needed for that.",
     }
-    per_class = metrics[split]["scan2cad"]["per_class"]
+    per_class = metrics[split]["strict"]["per_class"]
     return SplitScores(
         title=SPLITS[split].capitalize(),
         meaning=meaning[split],

@@ -94,7 +94,7 @@ def evaluate_model(
         progress: show a progress bar.
 
     Returns:
-        ``scan2cad`` and ``box_f1`` with protocol and counts as in ``raytran.metrics``, ``occupancy_iou``,
+        per protocol (``strict``) what ``Scan2CADAccuracy`` and ``OrientedBoxF1`` return, ``occupancy_iou``,
         ``foreground_iou`` and what ``about`` says.
     """
     device = next(model.parameters()).device
@@ -108,8 +108,7 @@ def evaluate_model(
     found = scores.results()
     metrics: dict[str, Any] = dict(about or {})
     metrics |= {"score_threshold": score_threshold, "duplicate_iou": duplicate_iou}
-    metrics["scan2cad"] = {"protocol": "strict", **found["accuracy"]}
-    metrics["box_f1"] = {"protocol": "strict", **found["box_f1"]}
+    metrics["strict"] = found["accuracy"] | {"per_threshold": found["box_f1"]["per_threshold"]}
     metrics |= {f"{task}_iou": found[task] for task in ("occupancy", "foreground") if task in found}
     if output is not None:
         with replaced_folder(output, marker=MARKER) as folder:
@@ -122,7 +121,7 @@ def evaluate_model(
 def metrics_table(metrics: Mapping[str, Any], *, title: str) -> Table:
     """Return the numbers as a table for the terminal."""
     table = Table("class", "found", "objects", "accuracy", title=title)
-    accuracy = metrics["scan2cad"]
+    accuracy = metrics["strict"]
     for name, entry in accuracy["per_class"].items():
         if entry["n_total"]:
             table.add_row(name, str(entry["n_good"]), str(entry["n_total"]), f"{entry['accuracy']:.1%}")
@@ -132,7 +131,7 @@ def metrics_table(metrics: Mapping[str, Any], *, title: str) -> Table:
         "all objects", str(accuracy["n_good"]), str(accuracy["n_total"]), f"{accuracy['global_average']:.1%}"
     )
     table.add_section()
-    for threshold, entry in metrics["box_f1"]["per_threshold"].items():
+    for threshold, entry in metrics["strict"]["per_threshold"].items():
         table.add_row(
             f"F1 at IoU {threshold}", str(entry["n_matched"]), str(entry["n_true"]), f"{entry['f1']:.3f}"
         )

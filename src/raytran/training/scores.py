@@ -15,7 +15,7 @@ from raytran.metrics.records import Row
 from raytran.metrics.scan2cad import Scan2CADAccuracy
 from raytran.metrics.scene import ForegroundIoU, SceneOccupancyIoU
 from raytran.postprocess import select_objects
-from raytran.types import SceneBatch, ScenePrediction
+from raytran.types import ObjectSet, SceneBatch, ScenePrediction
 
 SCORE_THRESHOLD = 0.5
 DUPLICATE_IOU = 0.25
@@ -38,18 +38,19 @@ class SceneScores(nn.Module):
         duplicate_iou: float | None = DUPLICATE_IOU,
     ) -> None:
         super().__init__()
-        self._select = partial(select_objects, score_threshold=score_threshold, duplicate_iou=duplicate_iou)
+        self._select = partial(select_objects, duplicate_iou=duplicate_iou)
+        self._score_threshold = score_threshold
         self.accuracy = Scan2CADAccuracy(protocol="strict") if "objects" in tasks else None
         self.box_f1 = OrientedBoxF1(protocol="strict") if "objects" in tasks else None
+        # Sees predictions of every score, to tell which threshold would have been the best.
+        self.box_f1_sweep = OrientedBoxF1(protocol="strict") if "objects" in tasks else None
         self.occupancy = SceneOccupancyIoU() if "occupancy" in tasks else None
         self.foreground = ForegroundIoU() if "foreground" in tasks else None
 
     def update(self, batch: SceneBatch, predictions: Sequence[ScenePrediction]) -> None:
         """Add scenes; a metric whose targets the batch lacks is left as it is."""
-        if self.accuracy is not None and self.box_f1 is not None and batch.objects is not None:
-            kept = [self._select(prediction).objects for prediction in predictions]
-            self.accuracy.update(kept, batch.objects, batch.scene_id)
-            self.box_f1.update(kept, batch.objects, batch.scene_id)
+        if batch.objects is not None:
+            self._update_objects(batch, batch.objects, predictions)
         for index, prediction in enumerate(predictions):
             if (
                 self.occupancy is not None
@@ -64,11 +65,24 @@ class SceneScores(nn.Module):
             ):
                 self.foreground.update(prediction.foreground, batch.foreground[index])
 
+    def _update_objects(
+        self, batch: SceneBatch, targets: Sequence[ObjectSet], predictions: Sequence[ScenePrediction]
+    ) -> None:
+        if self.accuracy is None or self.box_f1 is None or self.box_f1_sweep is None:
+            return
+        kept = [self._select(p, score_threshold=self._score_threshold).objects for p in predictions]
+        self.accuracy.update(kept, targets, batch.scene_id)
+        self.box_f1.update(kept, targets, batch.scene_id)
+        every = [self._select(p, score_threshold=0.0).objects for p in predictions]
+        self.box_f1_sweep.update(every, targets, batch.scene_id)
+
     def results(self) -> dict[str, Any]:
-        """Return everything the metrics say, by metric, as plain Python."""
-        return {
-            name: _plain(metric.compute()) for name, metric in self._metrics().items() if metric.update_called
-        }
+        """Return everything the metrics say, by metric, as plain Python; every rank must call it."""
+        found = {name: _plain(metric.compute()) for name, metric in self._metrics().items()}
+        sweep = found.pop("box_f1_sweep", {"per_threshold": {}})
+        for threshold, scores in sweep["per_threshold"].items():
+            found["box_f1"]["per_threshold"][threshold]["best"] = scores["best"]
+        return found
 
     def compute(self) -> dict[str, float]:
         """Return the numbers to watch during training, by ``task/number``."""

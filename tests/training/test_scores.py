@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The scores of a split: what counts as predicted, and what another threshold would have given."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from raytran.geometry.rotation import rotation_from_yaw
+from raytran.training.scores import SceneScores
+from raytran.types import ObjectSet, SceneBatch, ScenePrediction, Views
+
+
+def objects(centers: list[list[float]], scores: list[float]) -> ObjectSet:
+    count = len(centers)
+    return ObjectSet(
+        label=torch.full((count,), 3),
+        center=torch.tensor(centers),
+        size=torch.ones(count, 3),
+        rotation=rotation_from_yaw(torch.zeros(count)),
+        symmetry=torch.ones(count, dtype=torch.int64),
+        score=torch.tensor(scores),
+    )
+
+
+def batch(truth: ObjectSet) -> SceneBatch:
+    views = Views(torch.zeros(1, 1, 3, 16, 16), torch.eye(3)[None, None], torch.eye(4)[None, None])
+    return SceneBatch(("a",), views, (("0",),), torch.zeros(1, 3), objects=(truth,))
+
+
+def test_threshold_counts_and_best_looks_below_it() -> None:
+    truth = objects([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]], [1.0, 1.0])
+    found = objects([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0], [0.0, 3.0, 0.0]], [0.9, 0.4, 0.1])
+    scores = SceneScores(tasks=["objects"], score_threshold=0.5, duplicate_iou=None)
+    scores.update(batch(truth), [ScenePrediction("a", found, torch.zeros(3))])
+    results = scores.results()
+    assert results["accuracy"]["n_good"] == 1
+    at_half = results["box_f1"]["per_threshold"]["0.5"]
+    assert (at_half["n_predicted"], at_half["n_matched"]) == (1, 1)
+    assert at_half["best"]["f1"] == pytest.approx(1.0)
+    assert at_half["best"]["score_threshold"] == pytest.approx(0.4)
+    assert "box_f1_sweep" not in results
+
+
+def test_only_metrics_of_the_tasks() -> None:
+    truth = objects([[0.0, 0.0, 0.0]], [1.0])
+    scores = SceneScores(tasks=["objects"])
+    scores.update(batch(truth), [ScenePrediction("a", truth, torch.zeros(3))])
+    assert set(scores.compute()) == {
+        "objects/accuracy_global",
+        "objects/accuracy_class",
+        "objects/f1_0.25",
+        "objects/f1_0.5",
+    }
+    scores.reset()
+    assert scores.results()["accuracy"]["n_total"] == 0
