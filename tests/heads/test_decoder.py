@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import pytest
 import torch
 
 from raytran.geometry.grid import VoxelGrid
-from raytran.heads.decoder import DecoderLayer, WindowedAttention
+from raytran.heads.decoder import DecoderLayer, VoxelAttention, WindowedAttention
 
 
 def voxel_centers() -> torch.Tensor:
@@ -45,9 +46,24 @@ def test_windows_of_the_heads_begin_between_30_cm_and_1_m() -> None:
     assert bool((width.diff() > 0).all())
 
 
-def test_every_parameter_gets_a_gradient() -> None:
+def test_attention_to_all_voxels_equals_the_formula(generator: torch.Generator) -> None:
     torch.manual_seed(0)
-    layer = DecoderLayer(channels=8, num_heads=2, hidden=16)
+    attention = VoxelAttention(channels=8, num_heads=2)
+    queries, memory = torch.randn(1, 3, 8, generator=generator), torch.randn(1, 5, 8, generator=generator)
+    query, key, value = attention.query(queries)[0], attention.key(memory)[0], attention.value(memory)[0]
+    read = [
+        (query[:, part] @ key[:, part].T / 2).softmax(dim=-1) @ value[:, part]
+        for part in (slice(0, 4), slice(4, 8))
+    ]
+    expected = attention.output(torch.cat(read, dim=-1))
+    found = attention(queries, torch.zeros(1, 3, 3), memory, torch.zeros(5, 3))
+    torch.testing.assert_close(found[0], expected, atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("windowed", [False, True])
+def test_every_parameter_gets_a_gradient(windowed: bool) -> None:
+    torch.manual_seed(0)
+    layer = DecoderLayer(channels=8, num_heads=2, hidden=16, windowed=windowed)
     place = voxel_centers()
     out = layer(
         torch.randn(1, 3, 8), torch.randn(1, 3, 8), torch.zeros(1, 3, 3), torch.randn(1, 60, 8), place

@@ -11,7 +11,15 @@ EXTENT = (4.0, 4.0, 2.0)
 
 def small_head(**changes: int) -> ObjectHead:
     torch.manual_seed(0)
-    sizes = {"channels": 24, "num_heads": 2, "num_layers": 2, "num_queries": 6, "hidden": 24, **changes}
+    sizes = {
+        "channels": 24,
+        "num_heads": 2,
+        "num_layers": 2,
+        "num_queries": 6,
+        "hidden": 24,
+        "windowed": True,
+        **changes,
+    }
     return ObjectHead(**sizes, grid_extent=EXTENT)
 
 

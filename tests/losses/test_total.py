@@ -107,7 +107,13 @@ def test_a_small_decoder_overfits_two_scenes(make_objects) -> None:
     """From voxel features that tell the scenes apart; centres within 10 cm after 150 steps."""
     torch.manual_seed(0)
     head = ObjectHead(
-        channels=24, num_heads=2, num_layers=2, num_queries=8, hidden=48, grid_extent=(5.0, 5.0, 5.0)
+        channels=24,
+        num_heads=2,
+        num_layers=2,
+        num_queries=8,
+        hidden=48,
+        windowed=True,
+        grid_extent=(5.0, 5.0, 5.0),
     )
     voxels = torch.randn(2, 4, 4, 4, 24)
     grid = VoxelGrid((4, 4, 4), (5.0, 5.0, 5.0), torch.zeros(2, 3))

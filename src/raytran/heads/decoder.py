@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """One layer of the DETR-style decoder: queries attend to each other and to the voxels (RayTran §3.2).
 
-Each query has a reference point in the volume. Its attention to the voxels is weighted by a Gaussian window
-around that point, whose offset and width every head learns (SMCA, Gao et al., ICCV 2021), and besides the
-features it reads the mean position of the voxels attended, relative to the reference point. Plain DETR has
-to learn both from data, which takes hundreds of epochs.
+Each query has a reference point in the volume. It attends to all voxels alike, as in DETR, or through a
+Gaussian window around that point, whose offset and width every head learns (SMCA, Gao et al., ICCV 2021); it
+then reads, besides the features, the mean position of the voxels attended, relative to the reference point.
+Plain DETR has to learn both from data, which takes hundreds of epochs.
 """
 
 from __future__ import annotations
@@ -21,20 +21,22 @@ UNIT = 0.1
 
 
 class DecoderLayer(nn.Module):
-    """Self-attention, windowed attention to the voxels, feed-forward; normalisation comes before each.
+    """Self-attention, attention to the voxels, feed-forward; normalisation comes before each.
 
     Args:
         channels: C of queries and voxels.
         num_heads: attention heads.
         hidden: channels inside the feed-forward.
+        windowed: attend through a window around the reference point instead of to all voxels alike.
     """
 
-    def __init__(self, *, channels: int, num_heads: int, hidden: int) -> None:
+    def __init__(self, *, channels: int, num_heads: int, hidden: int, windowed: bool) -> None:
         super().__init__()
         self.self_norm = nn.LayerNorm(channels)
         self.self_attention = nn.MultiheadAttention(channels, num_heads, batch_first=True)
         self.voxel_norm = nn.LayerNorm(channels)
-        self.voxel_attention = WindowedAttention(channels=channels, num_heads=num_heads)
+        attention = WindowedAttention if windowed else VoxelAttention
+        self.voxel_attention = attention(channels=channels, num_heads=num_heads)
         self.feed_forward = nn.Sequential(
             nn.LayerNorm(channels), nn.Linear(channels, hidden), nn.GELU(), nn.Linear(hidden, channels)
         )
@@ -62,12 +64,8 @@ class DecoderLayer(nn.Module):
         return queries + self.feed_forward(queries)
 
 
-class WindowedAttention(nn.Module):
-    """Multi-head attention to voxels, in a Gaussian window around each query's reference point.
-
-    The score of query q and voxel v in a head is ``q·k / √D - |x_v - c|² / 2σ²``. Up to a constant in v,
-    which the softmax cancels, its second term is the dot product of ``(c, -½) / σ²`` and ``(x_v, |x_v|²)``:
-    four more channels of query and key, so that no bias matrix of Q × V is ever stored.
+class VoxelAttention(nn.Module):
+    """Multi-head attention to all voxels.
 
     Args:
         channels: C.
@@ -80,6 +78,34 @@ class WindowedAttention(nn.Module):
         self.query = nn.Linear(channels, channels)
         self.key = nn.Linear(channels, channels, bias=False)  # a key bias cancels in the softmax
         self.value = nn.Linear(channels, channels)
+        self.output = nn.Linear(channels, channels)
+
+    def forward(self, queries: Tensor, reference: Tensor, memory: Tensor, voxel_position: Tensor) -> Tensor:
+        """Return ``(B, Q, C)``; the arguments are those of ``DecoderLayer.forward``."""
+        query, key, value = (
+            self._heads(x) for x in (self.query(queries), self.key(memory), self.value(memory))
+        )
+        return self.output(F.scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(2))
+
+    def _heads(self, x: Tensor) -> Tensor:
+        """Map ``(B, n, C)`` to ``(B, heads, n, D)``."""
+        return x.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
+
+
+class WindowedAttention(VoxelAttention):
+    """Multi-head attention to voxels, in a Gaussian window around each query's reference point.
+
+    The score of query q and voxel v in a head is ``q·k / √D - |x_v - c|² / 2σ²``. Up to a constant in v,
+    which the softmax cancels, its second term is the dot product of ``(c, -½) / σ²`` and ``(x_v, |x_v|²)``:
+    four more channels of query and key, so that no bias matrix of Q × V is ever stored.
+
+    Args:
+        channels: C.
+        num_heads: attention heads.
+    """
+
+    def __init__(self, *, channels: int, num_heads: int) -> None:
+        super().__init__(channels=channels, num_heads=num_heads)
         self.window = nn.Linear(channels, 4 * num_heads)
         self.output = nn.Linear(channels + 3 * num_heads, channels)
         nn.init.normal_(self.window.weight, std=0.01)
@@ -107,10 +133,6 @@ class WindowedAttention(nn.Module):
             relative = (mean_position - reference.float()[:, None]) / UNIT
             read = torch.cat([features, relative], dim=-1).transpose(1, 2).flatten(2)
         return self.output(read)
-
-    def _heads(self, x: Tensor) -> Tensor:
-        """Map ``(B, n, C)`` to ``(B, heads, n, D)``."""
-        return x.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
 
     def _window(self, parameters: Tensor, reference: Tensor) -> Tensor:
         """Return ``(c, -½) / σ²``, ``(B, heads, Q, 4)``."""

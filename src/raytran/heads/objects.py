@@ -35,6 +35,8 @@ class ObjectHead(nn.Module):
         num_layers: decoder layers L.
         num_queries: Q.
         hidden: channels inside the decoder's feed-forward.
+        windowed: attend to the voxels through a learned window around the reference point, which learns from
+            few scenes; False attends to all voxels alike, as in DETR and the paper.
         grid_extent: sizes of the voxel grid, metres, over which the reference points spread at first.
     """
 
@@ -48,6 +50,7 @@ class ObjectHead(nn.Module):
         num_layers: int = 6,
         num_queries: int = 64,
         hidden: int = 1024,
+        windowed: bool = False,
         grid_extent: Sequence[float] = (9.0, 9.0, 3.5),
     ) -> None:
         super().__init__()
@@ -59,7 +62,8 @@ class ObjectHead(nn.Module):
         self.query = nn.Parameter(QUERY_SCALE * torch.randn(num_queries, channels))
         self.position = nn.Linear(channels, channels)
         self.layers = nn.ModuleList(
-            DecoderLayer(channels=channels, num_heads=num_heads, hidden=hidden) for _ in range(num_layers)
+            DecoderLayer(channels=channels, num_heads=num_heads, hidden=hidden, windowed=windowed)
+            for _ in range(num_layers)
         )
         self.predictors = nn.ModuleList(ObjectPredictor(channels=channels) for _ in range(num_layers))
 
