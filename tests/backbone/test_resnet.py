@@ -82,6 +82,21 @@ def test_offline_the_error_says_what_to_put_where(monkeypatch: pytest.MonkeyPatc
     assert str(place) in str(caught.value)
 
 
+def test_auto_goes_on_with_random_weights_offline_and_says_so(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise URLError("no network")
+
+    monkeypatch.setattr(torch.hub, "load_state_dict_from_url", fail)
+    torch.manual_seed(0)
+    network = ResNet18(weights="auto")
+    torch.manual_seed(0)
+    torch.testing.assert_close(network.conv1.weight, ResNet18().conv1.weight)
+    assert "random weights" in caplog.text
+    assert "download https://download.pytorch.org" in caplog.text
+
+
 def test_missing_damaged_and_foreign_files(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match="no ResNet-18 weights at"):
         ResNet18(weights=tmp_path / "absent.pth")

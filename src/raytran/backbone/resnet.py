@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import cast
 from urllib.error import URLError
@@ -11,6 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from raytran.errors import CheckpointError, ConfigError
+
+_log = logging.getLogger(__name__)
 
 IMAGENET_URL = "https://download.pytorch.org/models/resnet18-f37072fd.pth"
 """torchvision's ``ResNet18_Weights.IMAGENET1K_V1``; the name carries the first digits of its SHA-256."""
@@ -47,8 +50,9 @@ class ResNet18(nn.Module):
         width: channels of the first stage; 64 is ResNet-18, the output has ``8 · width``.
         input_channels: 3, or 4 with a mask as input (RayTran §4). Weights for three channels are kept and
             the fourth starts at zero, so that the network begins as the pretrained one.
-        weights: None (random), ``"imagenet"`` (fetched by URL, hash checked), or a file with a state dict
-            under torchvision's names, with or without ``fc``. Needed only at construction.
+        weights: None (random), ``"imagenet"`` (fetched by URL, hash checked), ``"auto"`` (the same, but
+            random with a warning where they cannot be fetched), or a file with a state dict under
+            torchvision's names, with or without ``fc``. Needed only at construction.
 
     Raises:
         ConfigError: weights are given for another width.
@@ -84,7 +88,18 @@ class ResNet18(nn.Module):
         return self.layer4(self.layer3(self.layer2(self.layer1(x))))
 
     def _load(self, weights: str | Path) -> None:
-        state = _fetch_imagenet() if weights == "imagenet" else _read_state(Path(weights))
+        if weights in ("imagenet", "auto"):
+            try:
+                state = _fetch_imagenet()
+            except CheckpointError as error:
+                if weights == "imagenet":
+                    raise
+                _log.warning(
+                    "the image encoder starts from random weights, which learns far slower: %s", error
+                )
+                return
+        else:
+            state = _read_state(Path(weights))
         state = {key: value for key, value in state.items() if not key.startswith("fc.")}
         first = state.get("conv1.weight")
         if first is not None and first.shape[1] == 3 and self.input_channels == 4:
