@@ -35,7 +35,7 @@ def test_frames_without_image_or_valid_pose_are_dropped_with_the_reason(write_sc
     (folder / "pose" / "6.txt").unlink()
     scan = read_scan(folder)
     assert scan.frame_id == ("0",)
-    rigid = "pose is not a rigid motion"
+    rigid = "pose is not finite or no rigid motion"
     assert scan.dropped == {"1": rigid, "2": rigid, "3": rigid, "4": rigid, "5": "no image", "6": "no pose"}
 
 

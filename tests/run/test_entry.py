@@ -50,10 +50,21 @@ def test_a_defect_keeps_its_traceback():
         run_or_exit(lambda cfg: 1 / 0, OmegaConf.create())
 
 
-def test_an_unknown_setting_fails(tmp_path):
-    done = run("raytran.train", "preset=tiny", "learning_speed=3", folder=tmp_path)
-    assert done.returncode != 0
-    assert "learning_speed" in done.stderr
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        ("learning_speed=3", "learning_speed"),
+        ("model=tinny", "model/tinny"),
+        ("seed", "key=value"),
+        ("resume=elsewhere.ckpt", "give resume=auto"),
+    ],
+)
+def test_a_wrong_setting_is_one_sentence(tmp_path, typed, said):
+    done = run("raytran.train", typed, folder=tmp_path)
+    assert done.returncode == 1
+    (sentence,) = done.stderr.splitlines()
+    assert sentence.startswith("raytran: ")
+    assert said in sentence
     assert not any(tmp_path.iterdir())
 
 

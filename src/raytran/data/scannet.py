@@ -78,7 +78,7 @@ def read_scan(folder: Path) -> Scan:
         if name not in images or name not in pose_files:
             dropped[name] = "no image" if name not in images else "no pose"
         elif (pose := _read_matrix(pose_files[name])) is None or not _is_rigid(pose):
-            dropped[name] = "pose is not a rigid motion"
+            dropped[name] = "pose is not finite or no rigid motion"
         else:
             poses[name] = pose
     if not poses:

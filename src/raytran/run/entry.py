@@ -12,13 +12,16 @@ from typing import Any
 import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import InstantiationException
+from hydra.errors import ConfigCompositionException, InstantiationException, OverrideParseException
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from raytran.errors import ConfigError, RaytranError
 from raytran.run.config_dir import config_dir
 from raytran.run.folders import register_resolvers
+
+_FULL_ERROR = "HYDRA_FULL_ERROR"
+"""Hydra's own switch: with it set to 1, errors are shown at length."""
 
 
 def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], Any]]:
@@ -30,8 +33,11 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
     register_resolvers()
 
     def decorate(function: Callable[[DictConfig], Any]) -> Callable[[], Any]:
+        typed = os.environ.get(_FULL_ERROR)
+
         @functools.wraps(function)
         def task(cfg: DictConfig) -> Any:
+            _set_full_error(typed)
             if "output_dir" in cfg:
                 # Lightning starts further ranks with hydra.run.dir of the first: all share one folder.
                 cfg.output_dir = HydraConfig.get().runtime.output_dir
@@ -41,9 +47,39 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             main = hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=config_name)
         except ConfigError as error:
             _exit_with(error)
-        return main(task)
+        return functools.partial(_compose_or_exit, main(task), typed)
 
     return decorate
+
+
+def _compose_or_exit(command: Callable[[], Any], typed: str | None) -> Any:
+    """Run a command; a setting that does not exist becomes a sentence instead of Hydra's paragraph."""
+    _set_full_error("1")  # Hydra then raises instead of printing; the task restores what the user has set
+    try:
+        return command()
+    except ConfigCompositionException as error:
+        _set_full_error(typed)
+        _exit_with(
+            ConfigError(f"{_first_line(error)}: there is no such setting or choice (--help lists them)")
+        )
+    except OverrideParseException as error:
+        _set_full_error(typed)
+        _exit_with(ConfigError(f"{_first_line(error)}: settings are written key=value"))
+    except OmegaConfBaseException as error:
+        _set_full_error(typed)
+        # A resolver of ours that objects is wrapped by OmegaConf; its message is the clearer one.
+        _exit_with(ConfigError(_first_line(error).split("resolving interpolation: ")[-1]))
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0].rstrip(".")
+
+
+def _set_full_error(value: str | None) -> None:
+    if value is None:
+        os.environ.pop(_FULL_ERROR, None)
+    else:
+        os.environ[_FULL_ERROR] = value
 
 
 def run_or_exit(function: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
@@ -79,6 +115,6 @@ def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
 def _exit_with(error: RaytranError) -> None:
     sys.stderr.write(f"raytran: {error}\n")
     sys.stderr.flush()
-    if os.environ.get("HYDRA_FULL_ERROR") == "1":
+    if os.environ.get(_FULL_ERROR) == "1":
         raise error
     raise SystemExit(1)
