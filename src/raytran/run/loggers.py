@@ -5,8 +5,11 @@ from __future__ import annotations
 
 import csv
 import logging
+import os
+from netrc import NetrcParseError, netrc
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlparse
 
 from raytran.errors import ConfigError
 
@@ -16,15 +19,25 @@ LOGS = "logs"
 
 
 def wandb_logger(*, project: str, name: str, save_dir: str) -> Any:
-    """Return a logger to Weights & Biases, offline where the machine has no key."""
-    import wandb
+    """Return a logger to Weights & Biases, offline where the machine has no key; WANDB_MODE overrides."""
     from lightning.pytorch.loggers import WandbLogger
 
-    offline = not wandb.api.api_key
+    offline = "WANDB_MODE" not in os.environ and not _has_wandb_key()
     if offline:
         _log.info("no W&B key found: logging offline in %s (send it later with `wandb sync`)", save_dir)
     Path(save_dir).mkdir(parents=True, exist_ok=True)
     return WandbLogger(project=project, name=name, save_dir=save_dir, offline=offline)
+
+
+def _has_wandb_key() -> bool:
+    """Look where ``wandb login`` and its documentation put a key, without asking a server."""
+    if os.environ.get("WANDB_API_KEY") or os.environ.get("WANDB_IDENTITY_TOKEN_FILE"):
+        return True
+    host = urlparse(os.environ.get("WANDB_BASE_URL", "https://api.wandb.ai")).hostname or ""
+    try:
+        return netrc(os.environ.get("NETRC") or Path.home() / ".netrc").authenticators(host) is not None
+    except (OSError, NetrcParseError):
+        return False
 
 
 def tensorboard_logger(*, save_dir: str, name: str) -> Any:
