@@ -41,3 +41,8 @@ def test_world_and_voxel_coordinates_are_inverse_in_every_scene():
 def test_center_must_be_a_point():
     with pytest.raises(ShapeError, match="expected center"):
         VoxelGrid((3, 4, 5), (1, 1, 1), torch.zeros(2))
+
+
+def test_a_center_of_whole_numbers_is_not_cut_to_whole_metres():
+    grid = VoxelGrid((48, 48, 16), (9.0, 9.0, 3.5), (0, 0, 0))
+    torch.testing.assert_close(grid.lower, torch.tensor([-4.5, -4.5, -1.75]))

@@ -101,7 +101,9 @@ def read_scan(folder: Path) -> Scan:
     )
 
 
-def load_views(folder: Path, *, image_size: tuple[int, int], num_views: int) -> tuple[Views, tuple[str, ...]]:
+def load_views(
+    folder: str | Path, *, image_size: tuple[int, int], num_views: int
+) -> tuple[Views, tuple[str, ...]]:
     """Read evenly spread frames of a scan, without annotation; the same frames as an "even" ``SceneDataset``.
 
     Args:
@@ -115,6 +117,7 @@ def load_views(folder: Path, *, image_size: tuple[int, int], num_views: int) -> 
     Raises:
         DataError: see ``read_scan``; or fewer than two images can be read.
     """
+    folder = Path(folder)
     scan = read_scan(folder)
     if scan.dropped:
         total = len(scan) + len(scan.dropped)

@@ -26,7 +26,8 @@ class VoxelGrid:
     center: Tensor
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "center", torch.as_tensor(self.center))
+        center = torch.as_tensor(self.center)
+        object.__setattr__(self, "center", center if center.is_floating_point() else center.float())
         object.__setattr__(self, "resolution", tuple(int(n) for n in self.resolution))
         object.__setattr__(self, "extent", tuple(float(length) for length in self.extent))
         check_shape(self.center, "... 3", "center")
