@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from raytran.errors import ShapeError
+from raytran.ops import reference
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_attention import ray_attention
-from raytran.ops.reference import dense_ray_attention
 
 DIRECTIONS = ("pixels_to_voxels", "voxels_to_pixels")
 both_directions = pytest.mark.parametrize("direction", DIRECTIONS)
@@ -41,7 +41,7 @@ def test_equals_dense_attention_in_value_and_gradients(
     pairs = random_pairs(pixels, voxels, density)
     inputs = _inputs(pairs, direction, heads, dim, generator)
     actual = ray_attention(*inputs, pairs, direction)
-    expected = dense_ray_attention(*inputs, pairs, direction)
+    expected = reference.ray_attention(*inputs, pairs, direction)
     torch.testing.assert_close(actual, expected, atol=1e-5, rtol=0)
     weight = torch.randn(actual.shape, generator=generator)
     for mine, theirs in zip(
@@ -92,7 +92,7 @@ def test_large_scores_neither_overflow_nor_vanish(random_pairs, generator, direc
     query, key, value = _inputs(pairs, direction, 2, 4, generator)
     for shift in (300.0, -300.0):
         actual = ray_attention(query * 100, key * 100 + shift, value, pairs, direction)
-        expected = dense_ray_attention(
+        expected = reference.ray_attention(
             (query * 100).double(), (key * 100 + shift).double(), value.double(), pairs, direction
         )
         torch.testing.assert_close(actual, expected.float(), atol=1e-3, rtol=0)

@@ -13,8 +13,8 @@ import torch
 from raytran.errors import ShapeError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
+from raytran.ops import reference
 from raytran.ops.pairs import PairList
-from raytran.ops.reference import slab_trace_pairs
 from raytran.ops.traverse import trace_pairs
 
 
@@ -32,7 +32,7 @@ def test_equals_slab_test_of_every_voxel(random_cameras, spread, rays_per_cell):
     grid = VoxelGrid((6, 5, 3), (3.1, 2.3, 1.7), torch.tensor([0.1, -0.2, 0.05], dtype=torch.float64))
     actual = trace_pairs(cameras, grid, (3, 4), rays_per_cell)
     assert len(actual) > 10
-    _assert_equal(actual, slab_trace_pairs(cameras, grid, (3, 4), rays_per_cell))
+    _assert_equal(actual, reference.trace_pairs(cameras, grid, (3, 4), rays_per_cell))
 
 
 def test_equals_slab_test_of_every_voxel_for_grazing_cameras(random_cameras, generator):
@@ -54,7 +54,7 @@ def test_equals_slab_test_of_every_voxel_for_grazing_cameras(random_cameras, gen
     grid = VoxelGrid((6, 4, 3), (3.0, 2.0, 1.5), torch.zeros(3, dtype=torch.float64))
     actual = trace_pairs(cameras, grid, (3, 5), 1)
     assert len(actual) > 100
-    _assert_equal(actual, slab_trace_pairs(cameras, grid, (3, 5), 1))
+    _assert_equal(actual, reference.trace_pairs(cameras, grid, (3, 5), 1))
 
 
 def _exact_voxels(origin: list[Fraction], ray: list[Fraction], resolution: tuple[int, ...]) -> set[int]:

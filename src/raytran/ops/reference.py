@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The obvious, slow forms of the operations in this folder, for tests, benchmarks and readers."""
+"""The obvious, slow twins of the operations in this folder, under the same names, for tests and readers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def pair_mask(pairs: PairList) -> Tensor:
     return mask
 
 
-def dense_ray_attention(
+def ray_attention(
     query: Tensor, key: Tensor, value: Tensor, pairs: PairList, direction: Direction = "pixels_to_voxels"
 ) -> Tensor:
     """Compute ``raytran.ops.ray_attention.ray_attention`` by the whole score matrix, ``(H, T, S)``."""
@@ -34,18 +34,18 @@ def dense_ray_attention(
     return torch.einsum("hts,shd->thd", weight, value)
 
 
-def dense_splat(features: Tensor, pairs: PairList) -> tuple[Tensor, Tensor]:
+def splat_features(features: Tensor, pairs: PairList) -> tuple[Tensor, Tensor]:
     """Compute ``raytran.ops.splat.splat_features`` by a matrix product."""
     weight = pair_mask(pairs).T.to(features.dtype)
     count = weight.sum(dim=1, keepdim=True)
     return weight @ features / count.clamp(min=1), count[:, 0] > 0
 
 
-def slab_trace_pairs(
+def trace_pairs(
     cameras: Cameras,
     grid: VoxelGrid,
     feature_size: tuple[int, int],
-    rays_per_cell: int = 1,
+    rays_per_cell: int = 2,
     min_depth: float = 1e-9,
 ) -> PairList:
     """Compute ``raytran.ops.traverse.trace_pairs`` of one scene by testing each ray against each voxel.
