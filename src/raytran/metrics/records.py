@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A metric that keeps one record a scene, gathered exactly over the ranks of a distributed run."""
+"""Metrics that keep one record a scene, gathered exactly over the ranks of a distributed run."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, cast
 
 import torch
 from torch import Tensor
+from torch.nn import Module
 from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 from torchmetrics.utilities.distributed import gather_all_tensors
@@ -63,11 +64,11 @@ def _gather_float64(value: Tensor, group: Any = None) -> list[Tensor]:
     return gather_all_tensors(value.double(), group)
 
 
-class SceneRecordMetric(Metric):
-    """Base of the metrics over objects: each scene is judged when it is given, and kept as a record.
+class RecordMetric(Metric):
+    """Base of all our metrics: what is found in a scene is kept as a record, in float64 in any run.
 
     A scene is known by its id and counts once: a distributed sampler that repeats scenes to make the ranks
-    equal changes no result. Every scene given counts, with or without predictions.
+    equal changes no result.
     """
 
     is_differentiable = False
@@ -81,6 +82,44 @@ class SceneRecordMetric(Metric):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(dist_sync_fn=_gather_float64, **kwargs)
         self.add_state("records", default=[], dist_reduce_fx="cat")
+
+    def keep(self, record: SceneRecord) -> None:
+        """Add the record of a scene."""
+        records = cast("list[Tensor]", self.records)  # a tensor only while synchronised
+        records.append(record.encode().to(self._record_device()))
+
+    def scenes(self) -> list[SceneRecord]:
+        """Return the records in this process, or of all ranks while they are synchronised, one a scene."""
+        if isinstance(self.records, list) and not self.records:
+            return []
+        stream = dim_zero_cat(self.records).cpu()
+        found: dict[str, SceneRecord] = {}
+        for record in decode_records(stream, self.truth_columns, self.prediction_columns):
+            found.setdefault(record.scene_id, record)
+        return list(found.values())
+
+    def synchronised_scenes(self) -> list[SceneRecord]:
+        """Return the records of all ranks, one a scene; every rank must call it."""
+        with self.sync_context(dist_sync_fn=self.dist_sync_fn):
+            return self.scenes()
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], exclude_state: Sequence[str] = ()) -> Module:
+        """Follow the module to another device but not to another type: bf16 would garble the records."""
+        super()._apply(fn, exclude_state=(*exclude_state, "records"))
+        if isinstance(self.records, list):
+            self.records = [record.to(self._record_device()) for record in self.records]
+        self._computed = None  # the base class has cast it
+        return self
+
+    def _record_device(self) -> torch.device:
+        return torch.device("cpu") if self.device.type == "mps" else self.device  # MPS has no float64
+
+
+class SceneRecordMetric(RecordMetric):
+    """Base of the metrics over objects: each scene is judged when it is given.
+
+    Every scene given counts, with or without predictions.
+    """
 
     @abstractmethod
     def judge(self, predictions: ObjectSet, targets: ObjectSet) -> tuple[Tensor, Tensor]:
@@ -112,21 +151,9 @@ class SceneRecordMetric(Metric):
                 "expected predictions, targets and names of the same scenes, got "
                 f"{len(predictions)}, {len(targets)} and {len(scene_ids)}"
             )
-        records = cast("list[Tensor]", self.records)  # a tensor only while synchronised
-        device = "cpu" if self.device.type == "mps" else self.device  # MPS has no float64
         for predicted, target, scene_id in zip(predictions, targets, scene_ids, strict=True):
             tables = self.judge(_in_float64(predicted), _in_float64(target))
-            records.append(SceneRecord(scene_id, *tables).encode().to(device))
-
-    def scenes(self) -> list[SceneRecord]:
-        """Return the records in this process, or of all ranks while they are synchronised, one a scene."""
-        if isinstance(self.records, list) and not self.records:
-            return []
-        stream = dim_zero_cat(self.records).cpu()
-        found: dict[str, SceneRecord] = {}
-        for record in decode_records(stream, self.truth_columns, self.prediction_columns):
-            found.setdefault(record.scene_id, record)
-        return list(found.values())
+            self.keep(SceneRecord(scene_id, *tables))
 
     def rows(self, per: Literal["object", "scene"] = "object") -> list[Row]:
         """Return a table of all ranks' scenes; in a distributed run every rank must call it.
@@ -134,8 +161,7 @@ class SceneRecordMetric(Metric):
         Args:
             per: ``"object"`` for a row for each true object, ``"scene"`` for a row for each scene.
         """
-        with self.sync_context(dist_sync_fn=self.dist_sync_fn):
-            scenes = self.scenes()
+        scenes = self.synchronised_scenes()
         if per == "scene":
             return [self.scene_row(record) for record in scenes]
         return [row for record in scenes for row in self.object_rows(record)]

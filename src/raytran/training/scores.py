@@ -52,18 +52,19 @@ class SceneScores(nn.Module):
         if batch.objects is not None:
             self._update_objects(batch, batch.objects, predictions)
         for index, prediction in enumerate(predictions):
+            names = [batch.scene_id[index]]
             if (
                 self.occupancy is not None
                 and batch.occupancy is not None
                 and prediction.occupancy is not None
             ):
-                self.occupancy.update(prediction.occupancy, batch.occupancy[index])
+                self.occupancy.update(prediction.occupancy[None], batch.occupancy[index, None], names)
             if (
                 self.foreground is not None
                 and batch.foreground is not None
                 and prediction.foreground is not None
             ):
-                self.foreground.update(prediction.foreground, batch.foreground[index])
+                self.foreground.update(prediction.foreground[None], batch.foreground[index, None], names)
 
     def _update_objects(
         self, batch: SceneBatch, targets: Sequence[ObjectSet], predictions: Sequence[ScenePrediction]
