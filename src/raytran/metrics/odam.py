@@ -11,7 +11,13 @@ from torch import Tensor
 
 from raytran.errors import ConfigError
 from raytran.geometry.boxes import OrientedBoxes, box_iou
-from raytran.metrics.functional.box_f1 import BestScores, DetectionScores, best_f1, detection_scores
+from raytran.metrics.functional.box_f1 import (
+    BestScores,
+    DetectionScores,
+    average_precision,
+    best_f1,
+    detection_scores,
+)
 from raytran.metrics.functional.matching import match_in_order, score_order
 from raytran.metrics.records import Row, SceneRecord, SceneRecordMetric
 from raytran.types import CLASSES, ObjectSet
@@ -20,9 +26,15 @@ BOX_F1_PROTOCOLS: tuple[str, ...] = ("strict",)
 
 
 class ThresholdScores(DetectionScores):
-    """Scores of all predictions at one IoU threshold, and of those above the score that maximises F1."""
+    """Scores of all predictions at one IoU threshold, and of those above the score that maximises F1.
+
+    ``average_precision`` pools all classes, as F1 does; ``mean_average_precision`` is the mean over the
+    classes of the true objects.
+    """
 
     best: BestScores
+    average_precision: float
+    mean_average_precision: float
 
 
 class BoxF1Result(TypedDict):
@@ -87,16 +99,30 @@ class OrientedBoxF1(SceneRecordMetric):
     def compute(self) -> BoxF1Result:
         """Return precision, recall, F1 and counts at each IoU threshold."""
         scenes = self.scenes()
-        n_true = sum(len(scene.truths) for scene in scenes)
-        none = torch.zeros(0, self.prediction_columns, dtype=torch.float64)
-        predictions = torch.cat([none, *(scene.predictions for scene in scenes)])
-        per_threshold = {}
-        for column, threshold in enumerate(self.iou_thresholds, start=2):
-            matched = predictions[:, column] == 1
-            scores = detection_scores(int(matched.sum()), len(predictions), n_true)
-            best = best_f1(predictions[:, 1], matched, n_true)
-            per_threshold[f"{threshold:g}"] = ThresholdScores(**scores, best=best)
+        empty = torch.zeros(0, self.prediction_columns, dtype=torch.float64)
+        predictions = torch.cat([empty, *(scene.predictions for scene in scenes)])
+        truths = torch.cat([empty, *(scene.truths for scene in scenes)])
+        per_threshold = {
+            f"{threshold:g}": self._scores_at(column, predictions, truths[:, 0])
+            for column, threshold in enumerate(self.iou_thresholds, start=2)
+        }
         return BoxF1Result(per_threshold=per_threshold, n_scenes=len(scenes))
+
+    @staticmethod
+    def _scores_at(column: int, predictions: Tensor, true_label: Tensor) -> ThresholdScores:
+        """Return the scores of one threshold, whose matches are in ``column`` of ``predictions``."""
+        label, score, matched = predictions[:, 0], predictions[:, 1], predictions[:, column] == 1
+        n_true = len(true_label)
+        by_class = [
+            average_precision(score[label == k], matched[label == k], int((true_label == k).sum()))
+            for k in true_label.unique()
+        ]
+        return ThresholdScores(
+            **detection_scores(int(matched.sum()), len(predictions), n_true),
+            best=best_f1(score, matched, n_true),
+            average_precision=average_precision(score, matched, n_true),
+            mean_average_precision=sum(by_class) / max(len(by_class), 1),
+        )
 
     def object_rows(self, record: SceneRecord) -> list[Row]:
         """Return each object's highest IoU with a prediction of its class, and whether it is matched."""

@@ -20,6 +20,9 @@ from raytran.types import ObjectSet, SceneBatch, ScenePrediction
 SCORE_THRESHOLD = 0.5
 DUPLICATE_IOU = 0.25
 
+_OF_ALL_SCORES = ("best", "average_precision", "mean_average_precision")
+"""What only predictions of every score can tell."""
+
 
 class SceneScores(nn.Module):
     """Alignment accuracy and box F1 of objects, IoU of occupancy and foreground, over all scenes seen.
@@ -82,7 +85,7 @@ class SceneScores(nn.Module):
         found = {name: _plain(metric.compute()) for name, metric in self._metrics().items()}
         sweep = found.pop("box_f1_sweep", {"per_threshold": {}})
         for threshold, scores in sweep["per_threshold"].items():
-            found["box_f1"]["per_threshold"][threshold]["best"] = scores["best"]
+            found["box_f1"]["per_threshold"][threshold] |= {name: scores[name] for name in _OF_ALL_SCORES}
         return found
 
     def compute(self) -> dict[str, float]:
