@@ -37,6 +37,18 @@ CLASSES: tuple[str, ...] = (
 )
 """Class names in the order of their labels; a network adds the padding class behind them (RayTran §3.2)."""
 
+CLASS_BY_CATID: dict[str, str] = {
+    "02808440": "bathtub",
+    "02871439": "bookshelf",
+    "02933112": "cabinet",
+    "03001627": "chair",
+    "03211117": "display",
+    "04256520": "sofa",
+    "04379243": "table",
+    "02747177": "trashbin",
+}
+"""Class of each ShapeNet category (Scan2CAD EvaluateBenchmark.py); every other category is ``other``."""
+
 CLASS_COLORS: tuple[tuple[int, int, int], ...] = (
     (23, 190, 207),
     (140, 86, 75),
@@ -158,6 +170,62 @@ class ObjectSet(Parcel):
         none = torch.zeros(0, dtype=torch.int64)
         vectors = torch.zeros(0, 3)
         return ObjectSet(none, vectors, vectors, torch.zeros(0, 3, 3), none, torch.zeros(0))
+
+
+@dataclass(frozen=True)
+class CadAlignments(Parcel):
+    """The ``M`` CAD models that stand in one scan, true or predicted, in the order of their file.
+
+    A point of the CAD model (ShapeNet's ``model_normalized.obj``) goes to ``translation + R(quaternion) ·
+    diag(scale) · point`` in the scan, the world of the scan's poses. All floating-point fields are float64.
+
+    Attributes:
+        catid: ShapeNet category of each model, eight digits.
+        id_cad: name of each model within its category.
+        translation: ``(M, 3)`` where the CAD's origin stands, metres.
+        quaternion: ``(M, 4)`` [w, x, y, z] as given, of any length and either sign.
+        scale: ``(M, 3)`` metres per CAD unit.
+        score: ``(M,)`` confidence; ones for ground truth.
+        half_extent: ``(M, 3)`` half the size of the CAD's box, CAD units. Of predictions None, or given where
+            they are boxes rather than CAD models: then ``half_extent · scale`` is half the box's size.
+        center: ``(M, 3)`` centre of the CAD's box, CAD units; None for predictions.
+        symmetry: ``(M,)`` int64 as in ``ObjectSet``; None for predictions.
+        pose: ``(M, 4, 4)`` scan_from_cad as annotated, which is not quite a turn and a scaling if the scan
+            itself is scaled; None for predictions.
+        annotated_scale: ``(M, 3)`` scale as annotated, of either sign; None for predictions.
+    """
+
+    catid: tuple[str, ...]
+    id_cad: tuple[str, ...]
+    translation: Tensor
+    quaternion: Tensor
+    scale: Tensor
+    score: Tensor
+    half_extent: Tensor | None = None
+    center: Tensor | None = None
+    symmetry: Tensor | None = None
+    pose: Tensor | None = None
+    annotated_scale: Tensor | None = None
+
+    def __len__(self) -> int:
+        return len(self.catid)
+
+    @property
+    def model_id(self) -> tuple[str, ...]:
+        """``catid/id`` of each model."""
+        return tuple(f"{catid}/{name}" for catid, name in zip(self.catid, self.id_cad, strict=True))
+
+    @property
+    def category(self) -> tuple[str, ...]:
+        """Class of each model."""
+        return tuple(CLASS_BY_CATID.get(catid, "other") for catid in self.catid)
+
+    @staticmethod
+    def empty() -> CadAlignments:
+        """Return the predictions of a scene in which nothing was found."""
+        vectors = torch.zeros(0, 3, dtype=torch.float64)
+        ones = torch.zeros(0, dtype=torch.float64)
+        return CadAlignments((), (), vectors, torch.zeros(0, 4, dtype=torch.float64), vectors, ones)
 
 
 @dataclass(frozen=True)
