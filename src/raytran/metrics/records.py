@@ -121,6 +121,8 @@ class SceneRecordMetric(RecordMetric):
     Every scene given counts, with or without predictions.
     """
 
+    judges_shapes = False  # else ``judge`` is given the objects without their shapes
+
     @abstractmethod
     def judge(self, predictions: ObjectSet, targets: ObjectSet) -> tuple[Tensor, Tensor]:
         """Return ``truths`` and ``predictions`` of a scene's record; inputs are float64, on the CPU."""
@@ -152,7 +154,7 @@ class SceneRecordMetric(RecordMetric):
                 f"{len(predictions)}, {len(targets)} and {len(scene_ids)}"
             )
         for predicted, target, scene_id in zip(predictions, targets, scene_ids, strict=True):
-            tables = self.judge(_in_float64(predicted), _in_float64(target))
+            tables = self.judge(*(self._in_float64(objects) for objects in (predicted, target)))
             self.keep(SceneRecord(scene_id, *tables))
 
     def rows(self, per: Literal["object", "scene"] = "object") -> list[Row]:
@@ -166,14 +168,13 @@ class SceneRecordMetric(RecordMetric):
             return [self.scene_row(record) for record in scenes]
         return [row for record in scenes for row in self.object_rows(record)]
 
-
-def _in_float64(objects: ObjectSet) -> ObjectSet:
-    """Return the boxes of a set in float64 on the CPU, without shapes."""
-    boxes = replace(objects, shape=None).to("cpu")
-    return replace(
-        boxes,
-        center=boxes.center.detach().double(),
-        size=boxes.size.detach().double(),
-        rotation=boxes.rotation.detach().double(),
-        score=boxes.score.detach().double(),
-    )
+    def _in_float64(self, objects: ObjectSet) -> ObjectSet:
+        """Return the boxes of a set in float64 on the CPU."""
+        boxes = (objects if self.judges_shapes else replace(objects, shape=None)).to("cpu")
+        return replace(
+            boxes,
+            center=boxes.center.detach().double(),
+            size=boxes.size.detach().double(),
+            rotation=boxes.rotation.detach().double(),
+            score=boxes.score.detach().double(),
+        )

@@ -14,6 +14,7 @@ from raytran.metrics.odam import OrientedBoxF1
 from raytran.metrics.records import Row
 from raytran.metrics.scan2cad import Scan2CADAccuracy
 from raytran.metrics.scene import ForegroundIoU, SceneOccupancyIoU
+from raytran.metrics.shape import MatchedShapeScores
 from raytran.postprocess import select_objects
 from raytran.types import ObjectSet, SceneBatch, ScenePrediction
 
@@ -25,10 +26,10 @@ _OF_ALL_SCORES = ("best", "average_precision", "mean_average_precision")
 
 
 class SceneScores(nn.Module):
-    """Alignment accuracy and box F1 of objects, IoU of occupancy and foreground, over all scenes seen.
+    """Alignment accuracy, box F1 and shapes of objects, IoU of occupancy and masks, over all scenes seen.
 
     Args:
-        tasks: what the model predicts: some of ``objects``, ``occupancy``, ``foreground``.
+        tasks: what the model predicts: some of ``objects``, ``occupancy``, ``foreground``, ``shape``.
         score_threshold: objects with a lower score do not count as predicted.
         duplicate_iou: nor does one that overlaps a surer one of its class by more than this IoU.
     """
@@ -47,6 +48,7 @@ class SceneScores(nn.Module):
         self.box_f1 = OrientedBoxF1(protocol="strict") if "objects" in tasks else None
         # Sees predictions of every score, to tell which threshold would have been the best.
         self.box_f1_sweep = OrientedBoxF1(protocol="strict") if "objects" in tasks else None
+        self.shape = MatchedShapeScores() if "shape" in tasks else None
         self.occupancy = SceneOccupancyIoU() if "occupancy" in tasks else None
         self.foreground = ForegroundIoU() if "foreground" in tasks else None
 
@@ -80,6 +82,17 @@ class SceneScores(nn.Module):
         every = [self._select(p, score_threshold=0.0).objects for p in predictions]
         self.box_f1_sweep.update(every, targets, batch.scene_id)
 
+    def update_shapes(self, batch: SceneBatch, predictions: Sequence[ScenePrediction]) -> None:
+        """Add the shapes of scenes; apart from ``update``, since decoding them for every slot is dear.
+
+        Args:
+            batch: scenes whose objects have shapes.
+            predictions: with shapes for at least the objects that count as predicted.
+        """
+        if self.shape is not None and batch.objects is not None:
+            kept = [self._select(p, score_threshold=self._score_threshold).objects for p in predictions]
+            self.shape.update(kept, batch.objects, batch.scene_id)
+
     def results(self) -> dict[str, Any]:
         """Return everything the metrics say, by metric, as plain Python; every rank must call it."""
         found = {name: _plain(metric.compute()) for name, metric in self._metrics().items()}
@@ -103,11 +116,13 @@ class SceneScores(nn.Module):
         return numbers
 
     def rows(self, per: Literal["scene", "object"]) -> list[Row]:
-        """Return a row per scene or true object, the columns of both object metrics side by side."""
+        """Return a row per scene or true object, the columns of the object metrics side by side."""
         if self.accuracy is None or self.box_f1 is None:
             return []
-        pairs = zip(self.accuracy.rows(per), self.box_f1.rows(per), strict=True)
-        return [accuracy | box_f1 for accuracy, box_f1 in pairs]
+        tables = [
+            metric.rows(per) for metric in (self.accuracy, self.box_f1, self.shape) if metric is not None
+        ]
+        return [{k: v for row in rows for k, v in row.items()} for rows in zip(*tables, strict=True)]
 
     def reset(self) -> None:
         """Forget all scenes."""
