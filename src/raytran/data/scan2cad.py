@@ -77,7 +77,10 @@ def read_annotations(path: Path) -> dict[str, SceneAnnotation]:
     scenes: dict[str, SceneAnnotation] = {}
     try:
         for entry in entries:
-            scenes[str(entry["id_scan"])] = _scene(entry)
+            scene = _scene(entry)
+            if scene.scene_id in scenes:
+                raise ValueError(f"scene {scene.scene_id} occurs twice")
+            scenes[scene.scene_id] = scene
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise DataError(
             f"entry {len(scenes)} of {path} is not as in Scan2CAD's full_annotations.json "
@@ -160,7 +163,10 @@ def _scene(entry: dict[str, Any]) -> SceneAnnotation:
 def _matrices(trs: Sequence[dict[str, Sequence[float]]]) -> Tensor:
     """Return T · R · S of each, ``(M, 4, 4)`` float64; quaternions are [w, x, y, z]."""
     matrices = torch.eye(4, dtype=torch.float64).repeat(len(trs), 1, 1)
-    rotation = matrix_from_quaternion(_vectors([part["rotation"] for part in trs], 4))
+    quaternion = _vectors([part["rotation"] for part in trs], 4)
+    if (quaternion == 0).all(dim=1).any():
+        raise ValueError("a quaternion has length zero")
+    rotation = matrix_from_quaternion(quaternion)
     matrices[:, :3, :3] = rotation * _vectors([part["scale"] for part in trs], 3)[:, None]
     matrices[:, :3, 3] = _vectors([part["translation"] for part in trs], 3)
     return matrices

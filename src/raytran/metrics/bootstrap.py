@@ -47,21 +47,22 @@ class Comparison(TypedDict):
     n_scenes: int
 
 
-def class_counts(rows: Iterable[Row], scene_ids: Sequence[str]) -> Tensor:
+def class_counts(rows: Iterable[Row], scene_ids: Sequence[str], classes: Sequence[str] = CLASSES) -> Tensor:
     """Return found and annotated objects of each class in each scene.
 
     Args:
         rows: a row for each object with ``scene_id``, ``category`` and ``matched``; those of scenes that are
             not in ``scene_ids`` are left out.
         scene_ids: the ``S`` scenes, also those without objects.
+        classes: the ``K`` names that ``category`` may be.
 
     Returns:
         ``(S, 2 K)`` float64: the ``K`` classes' found objects, then their annotated objects.
     """
     position = {scene_id: index for index, scene_id in enumerate(scene_ids)}
-    counts = torch.zeros(len(scene_ids), 2, len(CLASSES), dtype=torch.float64)
+    counts = torch.zeros(len(scene_ids), 2, len(classes), dtype=torch.float64)
     index = [
-        (position[str(row["scene_id"])], CLASSES.index(str(row["category"])), bool(row["matched"]))
+        (position[str(row["scene_id"])], classes.index(str(row["category"])), bool(row["matched"]))
         for row in rows
         if row["scene_id"] in position
     ]

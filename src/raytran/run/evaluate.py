@@ -19,6 +19,7 @@ from rich.table import Table
 from torch.utils.data import Dataset
 
 from raytran.errors import ConfigError
+from raytran.errors import ConfigError
 from raytran.metrics.records import Row
 from raytran.model import RayTran
 from raytran.run.build import build_data
@@ -26,6 +27,7 @@ from raytran.run.checkpoint import load_model, prediction_settings
 from raytran.run.device import choose_device
 from raytran.run.entry import compose
 from raytran.run.output import check_replaceable, replaced_folder
+from raytran.run.score import score
 from raytran.run.score import score
 from raytran.training.scores import DUPLICATE_IOU, SCORE_THRESHOLD, SceneScores
 from raytran.types import SceneBatch
@@ -52,6 +54,10 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
         raise ConfigError("give either checkpoint=CKPT or predictions=DIR annotations=FILE, not both")
     if cfg.predictions is not None:
         return score(cfg)
+    if (cfg.checkpoint is None) == (cfg.predictions is None):
+        raise ConfigError("give either checkpoint=CKPT or predictions=DIR annotations=FILE, not both")
+    if cfg.predictions is not None:
+        return score(cfg)
     output = Path(cfg.output)
     check_replaceable(output.resolve(), marker=MARKER)
     settings = prediction_settings(cfg.checkpoint)
@@ -59,6 +65,7 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     overrides = list(HydraConfig.get().overrides.task)
     if not any(item.startswith("preset=") for item in overrides):
         cfg = compose("evaluate", [*overrides, f"preset={settings.preset}"])
+    cfg.split = cfg.split or "val"
     cfg.split = cfg.split or "val"
     # The checkpoint, not the preset, says which images and which grid its model was made for.
     cfg.views.image_size = list(settings.image_size)
