@@ -16,7 +16,7 @@ from torchmetrics.utilities import dim_zero_cat
 from torchmetrics.utilities.distributed import gather_all_tensors
 
 from raytran.errors import ShapeError
-from raytran.types import ObjectSet
+from raytran.types import CadAlignments, ObjectSet
 
 Row = dict[str, str | int | float | bool | None]
 """One line of a table: column name to value, None where there is none."""
@@ -118,14 +118,20 @@ class RecordMetric(Metric):
 class SceneRecordMetric(RecordMetric):
     """Base of the metrics over objects: each scene is judged when it is given.
 
-    Every scene given counts, with or without predictions.
+    Every scene given counts, with or without predictions, unless ``drops_missing``: then a scene whose
+    predictions are None, for which there is no result at all, is left out.
     """
 
     judges_shapes = False  # else ``judge`` is given the objects without their shapes
+    drops_missing: bool = False
 
     @abstractmethod
-    def judge(self, predictions: ObjectSet, targets: ObjectSet) -> tuple[Tensor, Tensor]:
-        """Return ``truths`` and ``predictions`` of a scene's record; inputs are float64, on the CPU."""
+    def judge(self, predictions: Any, targets: Any) -> tuple[Tensor, Tensor]:
+        """Return ``truths`` and ``predictions`` of a scene's record.
+
+        Both inputs are ``ObjectSet``, or ``CadAlignments`` for the protocols of published scripts; in float64
+        and on the CPU.
+        """
 
     @abstractmethod
     def object_rows(self, record: SceneRecord) -> list[Row]:
@@ -135,14 +141,13 @@ class SceneRecordMetric(RecordMetric):
     def scene_row(self, record: SceneRecord) -> Row:
         """Return the row of a scene."""
 
-    def update(
-        self, predictions: Sequence[ObjectSet], targets: Sequence[ObjectSet], scene_ids: Sequence[str]
-    ) -> None:
+    def update(self, predictions: Sequence[Any], targets: Sequence[Any], scene_ids: Sequence[str]) -> None:
         """Judge scenes.
 
         Args:
-            predictions: the predicted objects of each scene; all of them count.
-            targets: the annotated objects of each scene.
+            predictions: the predicted objects of each scene, ``ObjectSet`` or for the protocols of published
+                scripts ``CadAlignments``; all of them count. None: there is no result for the scene.
+            targets: the annotated objects of each scene, of the same type.
             scene_ids: the name of each scene.
 
         Raises:
@@ -154,7 +159,10 @@ class SceneRecordMetric(RecordMetric):
                 f"{len(predictions)}, {len(targets)} and {len(scene_ids)}"
             )
         for predicted, target, scene_id in zip(predictions, targets, scene_ids, strict=True):
-            tables = self.judge(*(self._in_float64(objects) for objects in (predicted, target)))
+            if predicted is None and self.drops_missing:
+                continue
+            found = type(target).empty() if predicted is None else predicted
+            tables = self.judge(*(self._in_float64(objects) for objects in (found, target)))
             self.keep(SceneRecord(scene_id, *tables))
 
     def rows(self, per: Literal["object", "scene"] = "object") -> list[Row]:
@@ -168,8 +176,10 @@ class SceneRecordMetric(RecordMetric):
             return [self.scene_row(record) for record in scenes]
         return [row for record in scenes for row in self.object_rows(record)]
 
-    def _in_float64(self, objects: ObjectSet) -> ObjectSet:
+    def _in_float64(self, objects: ObjectSet | CadAlignments) -> ObjectSet | CadAlignments:
         """Return the boxes of a set in float64 on the CPU."""
+        if isinstance(objects, CadAlignments):
+            return objects.to("cpu")
         boxes = (objects if self.judges_shapes else replace(objects, shape=None)).to("cpu")
         return replace(
             boxes,

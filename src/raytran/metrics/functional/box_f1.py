@@ -46,7 +46,7 @@ def best_f1(score: Tensor, matched: Tensor, n_true: int) -> BestScores:
 
     Args:
         score: ``(P,)`` of all predictions of all scenes.
-        matched: ``(P,)`` bool, whether a prediction took a true object.
+        matched: ``(P,)`` bool, whether a prediction took a true object, or how many it took.
         n_true: number of true objects.
 
     Returns:
@@ -69,7 +69,8 @@ def average_precision(score: Tensor, matched: Tensor, n_true: int) -> float:
 
     Args:
         score: ``(P,)`` of all predictions of all scenes.
-        matched: ``(P,)`` bool, whether a prediction took a true object.
+        matched: ``(P,)`` bool, whether a prediction took a true object, or how many it took; precision is
+            never counted above 1.
         n_true: number of true objects.
 
     Returns:
@@ -78,7 +79,7 @@ def average_precision(score: Tensor, matched: Tensor, n_true: int) -> float:
     if score.numel() == 0 or n_true == 0:
         return 0.0
     _, n_matched, n_predicted = _running_counts(score, matched)
-    precision = n_matched.double() / n_predicted
+    precision = (n_matched.double() / n_predicted).clamp(max=1)
     envelope = precision.flip(0).cummax(dim=0).values.flip(0)
     gained = n_matched.diff(prepend=n_matched.new_zeros(1))
     return float((envelope * gained).sum() / n_true)
@@ -89,5 +90,5 @@ def _running_counts(score: Tensor, matched: Tensor) -> tuple[Tensor, Tensor, Ten
     values, order = score.sort(descending=True, stable=True)
     n_matched = matched[order].long().cumsum(dim=0)
     n_predicted = torch.arange(1, len(values) + 1, device=score.device)
-    last_of_equals = torch.cat([values[1:] != values[:-1], torch.ones_like(matched[:1])])
+    last_of_equals = torch.cat([values[1:] != values[:-1], torch.ones_like(values[:1], dtype=torch.bool)])
     return values[last_of_equals], n_matched[last_of_equals], n_predicted[last_of_equals]
