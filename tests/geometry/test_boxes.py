@@ -138,7 +138,7 @@ def test_shapes_are_checked():
     ids=["room", "dense", "large room"],
 )
 def test_speed_against_sorting_a_million_numbers(counts, spread, limit, generator):
-    """A margin of four for busy machines; ``benchmarks/box_iou.py`` measures 0.03, 0.18 and 0.16 of the sort."""
+    """A margin of four for busy machines; ``benchmarks/box_iou.py`` measures 0.03, 0.18 and 0.16."""
     a, b = (random_boxes(count, generator, spread) for count in counts)
     numbers = torch.rand(1_000_000, generator=generator, dtype=torch.float64)
 
