@@ -37,7 +37,8 @@ class ScenePredictions:
     Attributes:
         path: the file.
         objects: boxes, for protocol ``strict``.
-        boxes: the same on the origins of the CAD models, where these are known, for ``odam``.
+        boxes: for ``odam``, on the origins of the CAD models where these are known; those of CAD alignments
+            get their size from the annotations.
         cads: CAD alignments in the order of the file, for ``scan2cad`` and ``vid2cad``; None if the file has
             objects without CAD models.
         n_unknown_cads: predictions left out of some of these, since the annotations do not know the box of
@@ -161,19 +162,19 @@ def _line_of_object(path: Path, index: int) -> int:
 def _from_alignments(path: Path, cads: CadAlignments, cad_boxes: CadBoxes) -> ScenePredictions:
     """Turn CAD alignments into boxes, as far as the CAD models are known."""
     known = torch.tensor([i for i, name in enumerate(cads.model_id) if name in cad_boxes], dtype=torch.int64)
-    boxes = _with_boxes(_select(cads, known), cad_boxes)
-    rotation = matrix_from_quaternion(boxes.quaternion)
-    center, half = _lookup(boxes.model_id, cad_boxes)
+    chosen = cads.select(known)
+    rotation = matrix_from_quaternion(chosen.quaternion)
+    center, half = _lookup(chosen.model_id, cad_boxes)
     objects = ObjectSet(
-        label=torch.tensor([CLASSES.index(name) for name in boxes.category], dtype=torch.int64),
-        center=boxes.translation + (rotation @ (boxes.scale * center)[..., None])[..., 0],
-        size=(2 * half * boxes.scale).clamp(min=_THINNEST),
+        label=torch.tensor([CLASSES.index(name) for name in chosen.category], dtype=torch.int64),
+        center=chosen.translation + (rotation @ (chosen.scale * center)[..., None])[..., 0],
+        size=(2 * half * chosen.scale).clamp(min=_THINNEST),
         rotation=rotation,
-        symmetry=torch.ones(len(boxes), dtype=torch.int64),
-        score=boxes.score,
-        model_id=boxes.model_id,
+        symmetry=torch.ones(len(chosen), dtype=torch.int64),
+        score=chosen.score,
+        model_id=chosen.model_id,
     )
-    return ScenePredictions(path, objects, boxes, cads, n_unknown_cads=len(cads) - len(known))
+    return ScenePredictions(path, objects, cads, cads, n_unknown_cads=len(cads) - len(known))
 
 
 def _from_objects(path: Path, objects: ObjectSet, cad_boxes: CadBoxes) -> ScenePredictions:
@@ -198,13 +199,9 @@ def _from_objects(path: Path, objects: ObjectSet, cad_boxes: CadBoxes) -> SceneP
     )
     complete = all(names)
     index = torch.tensor(known, dtype=torch.bool).nonzero().squeeze(1)
-    cads = replace(_select(boxes, index), half_extent=None) if complete else None
+    cads = replace(boxes.select(index), half_extent=None) if complete else None
     n_unknown = len(objects) - len(index) if complete else 0
     return ScenePredictions(path, objects, boxes, cads, n_unknown)
-
-
-def _with_boxes(alignments: CadAlignments, cad_boxes: CadBoxes) -> CadAlignments:
-    return replace(alignments, half_extent=_lookup(alignments.model_id, cad_boxes)[1])
 
 
 def _lookup(names: Collection[str], cad_boxes: CadBoxes) -> tuple[Tensor, Tensor]:
@@ -214,17 +211,3 @@ def _lookup(names: Collection[str], cad_boxes: CadBoxes) -> tuple[Tensor, Tensor
     if not found:
         return torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
     return torch.stack([center for center, _ in found]), torch.stack([half for _, half in found])
-
-
-def _select(alignments: CadAlignments, index: Tensor) -> CadAlignments:
-    chosen = index.tolist()
-    half = alignments.half_extent
-    return CadAlignments(
-        catid=tuple(alignments.catid[i] for i in chosen),
-        id_cad=tuple(alignments.id_cad[i] for i in chosen),
-        translation=alignments.translation[index],
-        quaternion=alignments.quaternion[index],
-        scale=alignments.scale[index],
-        score=alignments.score[index],
-        half_extent=None if half is None else half[index],
-    )

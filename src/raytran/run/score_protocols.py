@@ -28,6 +28,7 @@ from raytran.metrics.bootstrap import (
     global_average,
 )
 from raytran.metrics.curves import AccuracyCurves, accuracy_by_scene_size
+from raytran.metrics.functional.cad_errors import cad_symmetries
 from raytran.metrics.odam import OrientedBoxF1
 from raytran.metrics.records import Row
 from raytran.metrics.scan2cad import Scan2CADAccuracy
@@ -103,7 +104,7 @@ def _of_split(
         names = split.read_text(encoding="utf-8").split()
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"cannot read the scene names split={split} ({error}): check the path") from error
-    chosen = {name: scenes[name] for name in names if name in scenes}
+    chosen = {name: scene for name, scene in scenes.items() if name in set(names)}
     if not chosen:
         raise DataError(f"none of the {len(names)} scenes that {split} names is annotated in {annotations}")
     return chosen
@@ -150,12 +151,16 @@ def score_protocol(
     if protocol == "odam":
         names = [name for name in truth.alignments if name in files.scenes]
         boxes = [files.scenes[name].boxes for name in names]
-        metric: OrientedBoxF1 | Scan2CADAccuracy = OrientedBoxF1(protocol="odam")
+        half_extents = {name: half.tolist() for name, (_, half) in truth.cad_boxes.items()}
+        metric: OrientedBoxF1 | Scan2CADAccuracy = OrientedBoxF1(
+            protocol="odam", cad_half_extents=half_extents
+        )
     else:
         names = [name for name in truth.alignments if name in files.scenes or protocol == "vid2cad"]
         found = {name: scene.cads for name, scene in files.scenes.items()}
         boxes = [found.get(name) or CadAlignments.empty() for name in names]
-        metric = Scan2CADAccuracy(protocol=protocol)
+        symmetries = cad_symmetries(truth.alignments[name] for name in names)
+        metric = Scan2CADAccuracy(protocol=protocol, cad_symmetries=symmetries)
     metric.update(boxes, [truth.alignments[name] for name in names], names)
     return ProtocolScores(dict(metric.compute()), metric.rows("object"), metric.rows("scene"))
 
@@ -236,13 +241,14 @@ def _statistics(scores: ProtocolScores) -> dict[str, Statistic]:
 
 
 def _classes(scores: ProtocolScores) -> list[str]:
-    return sorted({str(row["category"]) for row in scores.objects})
+    """Return the classes that count; those of a protocol may be fewer than those of its rows."""
+    return [name for name, entry in scores.metrics.get("per_class", {}).items() if entry["n_total"]]
 
 
 def _counts(number: str, scores: ProtocolScores, names: Sequence[str], classes: Sequence[str]) -> Tensor:
     """Return what each scene adds to the sums behind a number, ``(S, C)``."""
     if not number.startswith("f1_"):
-        return class_counts(scores.objects, names, classes)
+        return class_counts([row for row in scores.objects if row["category"] in classes], names, classes)
     by_name = {row["scene_id"]: row for row in scores.scenes}
     columns = (number.replace("f1", "n_matched"), "n_predicted", "n_true")
     rows = [[float(by_name[name][column] or 0) for column in columns] for name in names]
