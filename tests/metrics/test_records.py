@@ -26,8 +26,9 @@ from raytran.metrics import (
     Scan2CADAccuracy,
     SceneOccupancyIoU,
 )
+from raytran.metrics.functional.cad_errors import cad_half_extents, cad_symmetries
 from raytran.metrics.records import SceneRecord, decode_records
-from raytran.types import ObjectSet
+from raytran.types import CadAlignments, ObjectSet
 
 SCENES = 7
 SHARES = {"unequal": ((0, 3, 5, 6), (1, 2, 4)), "one without": ((0, 1, 2, 3, 4, 5, 6), ()),
@@ -56,16 +57,61 @@ def scene(index: int) -> tuple[ObjectSet, ObjectSet, str]:
     return prediction, target, f"scene{index:04d}_00 – ü"
 
 
+def cads(index: int) -> tuple[CadAlignments | None, CadAlignments]:
+    """The same for the published scripts; scene 4 has no result."""
+    generator = torch.Generator().manual_seed(index)
+    count = index
+
+    def uniform(rows: int, columns: int, low: float, high: float) -> torch.Tensor:
+        return low + (high - low) * torch.rand(rows, columns, generator=generator, dtype=torch.float64)
+
+    standing = torch.tensor([0.5**0.5, 0.5**0.5, 0.0, 0.0], dtype=torch.float64)  # +Y of the CAD goes to +Z
+    turn = torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
+    translation, scale = uniform(count, 3, 0, 3), uniform(count, 3, 0.8, 1.2)
+    pose = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    pose[:, :3, :3], pose[:, :3, 3] = turn * scale[:, None], translation
+    kinds = torch.randint(0, 4, (count,), generator=generator).tolist()
+    catid = tuple(("03001627", "04379243", "02818832", "03636649")[kind] for kind in kinds)
+    target = CadAlignments(
+        catid,
+        tuple("ab"[kind % 2] for kind in kinds),
+        translation,
+        standing.expand(count, 4),
+        scale,
+        torch.ones(count, dtype=torch.float64),
+        half_extent=uniform(count, 3, 0.3, 0.6),
+        center=uniform(count, 3, -0.05, 0.05),
+        symmetry=torch.randint(0, 2, (count,), generator=generator),
+        pose=pose,
+        annotated_scale=scale,
+    )
+    source = torch.randint(0, max(count, 1), (2 * count,), generator=generator)
+    copies = replace(target, half_extent=None, center=None, symmetry=None, pose=None, annotated_scale=None)
+    copies = copies.select(source)
+    shifted = copies.translation + uniform(2 * count, 3, -0.12, 0.12)
+    scored = replace(copies, translation=shifted, score=uniform(2 * count, 1, 0, 1)[:, 0])
+    return None if index == 4 else scored, target
+
+
 def results(indices: tuple[int, ...], dtype: torch.dtype = torch.float32) -> dict:
     """Everything the metrics return for a share of the scenes, scenes given one by one."""
     of_objects = {"scan2cad": Scan2CADAccuracy(), "box_f1": OrientedBoxF1(), "shape": MatchedShapeScores()}
+    truths = [cads(index)[1] for index in range(SCENES)]
+    of_cads = {
+        "official": Scan2CADAccuracy(protocol="scan2cad", cad_symmetries=cad_symmetries(truths)),
+        "vid2cad": Scan2CADAccuracy(protocol="vid2cad"),
+        "odam": OrientedBoxF1(protocol="odam", cad_half_extents=cad_half_extents(truths)),
+    }
     of_cells = {"occupancy": SceneOccupancyIoU(), "foreground": ForegroundIoU()}
     of_images = {"psnr": PSNR(), "ssim": SSIM()}
-    every = of_objects | of_cells | of_images
+    every = of_objects | of_cads | of_cells | of_images
     for index in indices:
         prediction, target, name = scene(index)
         for metric in of_objects.values():
             metric.update([prediction], [target], [name])
+        found, true = cads(index)
+        for metric in of_cads.values():
+            metric.update([found], [true], [name])
         generator = torch.Generator().manual_seed(index)
         probability, truth = torch.rand(2, 1, 4, 4, 2, generator=generator)
         for metric in of_cells.values():
@@ -77,7 +123,7 @@ def results(indices: tuple[int, ...], dtype: torch.dtype = torch.float32) -> dic
             metric.to(dtype)
     found = {key: metric.compute() for key, metric in every.items()}
     found |= {key: found[key].item() for key in of_cells | of_images}
-    for key, metric in of_objects.items():
+    for key, metric in (of_objects | of_cads).items():
         for per in ("object", "scene"):
             rows = metric.rows(per)
             found[f"{key} {per}"] = sorted(rows, key=lambda row: (row["scene_id"], row.get("object")))
@@ -100,6 +146,9 @@ def test_two_ranks_equal_one_process(share, found_by_ranks):
     expected = json.loads(json.dumps(results(tuple(range(SCENES)))))
     assert expected["scan2cad"]["n_good"] > 5
     assert 0 < expected["shape"]["iou"] < 1
+    for key in ("official", "vid2cad"):
+        assert 0 < expected[key]["n_good"] < expected[key]["n_total"]
+    assert expected["odam"]["per_threshold"]["0.25"]["n_matched"] > 3
     for found in (by_share[share] for by_share in found_by_ranks):
         assert found == expected
 
