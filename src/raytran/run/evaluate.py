@@ -19,7 +19,7 @@ from rich.table import Table
 from torch.utils.data import Dataset
 
 from raytran.errors import ConfigError
-from raytran.errors import ConfigError
+from raytran.metrics.curves import accuracy_by_scene_size
 from raytran.metrics.records import Row
 from raytran.model import RayTran
 from raytran.run.build import build_data
@@ -27,7 +27,6 @@ from raytran.run.checkpoint import load_model, prediction_settings
 from raytran.run.device import choose_device
 from raytran.run.entry import compose
 from raytran.run.output import check_replaceable, replaced_folder
-from raytran.run.score import score
 from raytran.run.score import score
 from raytran.training.scores import DUPLICATE_IOU, SCORE_THRESHOLD, SceneScores
 from raytran.types import SceneBatch
@@ -54,10 +53,6 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
         raise ConfigError("give either checkpoint=CKPT or predictions=DIR annotations=FILE, not both")
     if cfg.predictions is not None:
         return score(cfg)
-    if (cfg.checkpoint is None) == (cfg.predictions is None):
-        raise ConfigError("give either checkpoint=CKPT or predictions=DIR annotations=FILE, not both")
-    if cfg.predictions is not None:
-        return score(cfg)
     output = Path(cfg.output)
     check_replaceable(output.resolve(), marker=MARKER)
     settings = prediction_settings(cfg.checkpoint)
@@ -65,7 +60,6 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     overrides = list(HydraConfig.get().overrides.task)
     if not any(item.startswith("preset=") for item in overrides):
         cfg = compose("evaluate", [*overrides, f"preset={settings.preset}"])
-    cfg.split = cfg.split or "val"
     cfg.split = cfg.split or "val"
     # The checkpoint, not the preset, says which images and which grid its model was made for.
     cfg.views.image_size = list(settings.image_size)
@@ -117,32 +111,49 @@ def evaluate_model(
         progress: show a progress bar.
 
     Returns:
-        per protocol (``strict``) what ``Scan2CADAccuracy`` and ``OrientedBoxF1`` return, ``occupancy_iou``,
-        ``foreground_iou``, under ``shape`` what ``MatchedShapeScores`` returns, and what ``about`` says.
+        per protocol (``strict``) what ``Scan2CADAccuracy`` and ``OrientedBoxF1`` return, with the accuracy
+        ``by_scene_size``, the ``curves`` and the error ``atlas``; ``occupancy_iou``, ``foreground_iou``,
+        under ``shape`` what ``MatchedShapeScores`` returns, and what ``about`` says.
     """
     device = next(model.parameters()).device
-    scores = SceneScores(tasks=tasks, score_threshold=score_threshold, duplicate_iou=duplicate_iou).to(device)
+    scores = SceneScores(
+        tasks=tasks,
+        score_threshold=score_threshold,
+        duplicate_iou=duplicate_iou,
+        volume_extent=model.grid_extent,
+    ).to(device)
     model.eval()
     for index in track(range(len(dataset)), "evaluating", disable=not progress, transient=True):  # type: ignore[arg-type]
-        batch = dataset[index].to(device)
-        with torch.no_grad():
-            raw = model(batch.views, tasks=TASKS, grid_center=batch.grid_center)
-            scores.update(batch, model.decode(raw, batch.scene_id, with_shapes=False))
-            if "shape" in tasks:
-                shaped = model.decode(raw, batch.scene_id, score_threshold=score_threshold)
-                scores.update_shapes(batch, shaped)
-    found = scores.results()
-    metrics: dict[str, Any] = dict(about or {})
-    metrics |= {"score_threshold": score_threshold, "duplicate_iou": duplicate_iou}
-    metrics["strict"] = found["accuracy"] | {"per_threshold": found["box_f1"]["per_threshold"]}
-    metrics |= {f"{task}_iou": found[task] for task in ("occupancy", "foreground") if task in found}
-    metrics |= {"shape": found["shape"]} if "shape" in found else {}
+        _predict_and_compare(model, dataset[index].to(device), scores, score_threshold)
+    settings = {"score_threshold": score_threshold, "duplicate_iou": duplicate_iou}
+    metrics = {**(about or {}), **settings, **_by_protocol(scores)}
     if output is not None:
         with replaced_folder(output, marker=MARKER) as folder:
             (folder / MARKER).write_text(json.dumps(metrics, indent=2) + "\n")
             _write_csv(folder / "per_scene.csv", scores.rows("scene"))
             _write_csv(folder / "per_object.csv", scores.rows("object"))
     return metrics
+
+
+@torch.no_grad()
+def _predict_and_compare(
+    model: RayTran, batch: SceneBatch, scores: SceneScores, score_threshold: float
+) -> None:
+    raw = model(batch.views, tasks=TASKS, grid_center=batch.grid_center)
+    scores.update(batch, model.decode(raw, batch.scene_id, with_shapes=False))
+    if scores.shape is not None:
+        scores.update_shapes(batch, model.decode(raw, batch.scene_id, score_threshold=score_threshold))
+
+
+def _by_protocol(scores: SceneScores) -> dict[str, Any]:
+    """Return what all metrics say in the layout of ``metrics.json``."""
+    found = scores.results()
+    strict = found["accuracy"] | {"per_threshold": found["box_f1"]["per_threshold"]}
+    strict["by_scene_size"] = accuracy_by_scene_size(scores.rows("object"))
+    strict |= {"curves": found["curves"], "atlas": found["atlas"]}
+    metrics: dict[str, Any] = {"strict": strict}
+    metrics |= {f"{task}_iou": found[task] for task in ("occupancy", "foreground") if task in found}
+    return metrics | ({"shape": found["shape"]} if "shape" in found else {})
 
 
 def metrics_table(metrics: Mapping[str, Any], *, title: str) -> Table:

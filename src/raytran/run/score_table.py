@@ -11,13 +11,13 @@ from rich.table import Table
 
 from raytran.run.score_protocols import PROTOCOLS
 
-_CAPTION = escape("[low – high]: 95 % of bootstrap draws of the scenes")
+_CAPTION = escape("[low–high]: 95 % of bootstrap draws of the scenes")
 _AVERAGES = {"class_average": "mean of classes", "global_average": "all objects"}
 _DETECTION = {
     "precision": "precision",
     "recall": "recall",
     "f1": "F1",
-    "average_precision": "average precision",
+    "average_precision": "AP",
 }
 
 
@@ -47,7 +47,7 @@ def scores_table(metrics: Mapping[str, Any], *, title: str) -> Table:
         for number, label in _DETECTION.items():
             cells = [_threshold_cell(part, threshold, number) for part in parts]
             if any(cells):
-                table.add_row(f"{label} at IoU {threshold}", *cells)
+                table.add_row(f"{label} @ {threshold}", *cells)
     return table
 
 
@@ -72,7 +72,7 @@ def _threshold_cell(part: Mapping[str, Any], threshold: str, number: str) -> str
 
 def _interval(part: Mapping[str, Any], number: str) -> str:
     bounds = part["confidence"].get(number)
-    return "" if bounds is None else escape(f"[{bounds['low']:.1%} – {bounds['high']:.1%}]")
+    return "" if bounds is None else escape(f"[{100 * bounds['low']:.1f}–{100 * bounds['high']:.1f}]")
 
 
 def atlas_table(atlas: Mapping[str, Any]) -> Table:

@@ -10,6 +10,8 @@ from typing import Any, Literal
 from torch import nn
 from torchmetrics import Metric
 
+from raytran.metrics.atlas import ErrorAtlas
+from raytran.metrics.curves import AccuracyCurves
 from raytran.metrics.odam import OrientedBoxF1
 from raytran.metrics.records import Row
 from raytran.metrics.scan2cad import Scan2CADAccuracy
@@ -32,6 +34,8 @@ class SceneScores(nn.Module):
         tasks: what the model predicts: some of ``objects``, ``occupancy``, ``foreground``, ``shape``.
         score_threshold: objects with a lower score do not count as predicted.
         duplicate_iou: nor does one that overlaps a surer one of its class by more than this IoU.
+        volume_extent: size of the voxel grid, metres; given, the results also tell why objects are missed
+            (``ErrorAtlas``) and how many would be found at other thresholds (``AccuracyCurves``).
     """
 
     def __init__(
@@ -40,6 +44,7 @@ class SceneScores(nn.Module):
         tasks: Collection[str],
         score_threshold: float = SCORE_THRESHOLD,
         duplicate_iou: float | None = DUPLICATE_IOU,
+        volume_extent: Sequence[float] | None = None,
     ) -> None:
         super().__init__()
         self._select = partial(select_objects, duplicate_iou=duplicate_iou)
@@ -48,6 +53,9 @@ class SceneScores(nn.Module):
         self.box_f1 = OrientedBoxF1(protocol="strict") if "objects" in tasks else None
         # Sees predictions of every score, to tell which threshold would have been the best.
         self.box_f1_sweep = OrientedBoxF1(protocol="strict") if "objects" in tasks else None
+        explain = "objects" in tasks and volume_extent is not None
+        self.curves = AccuracyCurves() if explain else None
+        self.atlas = ErrorAtlas(volume_extent=volume_extent) if explain else None
         self.shape = MatchedShapeScores() if "shape" in tasks else None
         self.occupancy = SceneOccupancyIoU() if "occupancy" in tasks else None
         self.foreground = ForegroundIoU() if "foreground" in tasks else None
@@ -79,6 +87,9 @@ class SceneScores(nn.Module):
         kept = [self._select(p, score_threshold=self._score_threshold).objects for p in predictions]
         self.accuracy.update(kept, targets, batch.scene_id)
         self.box_f1.update(kept, targets, batch.scene_id)
+        if self.curves is not None and self.atlas is not None:
+            self.curves.update(kept, targets, batch.scene_id)
+            self.atlas.update(kept, targets, batch.scene_id, list(batch.grid_center))
         every = [self._select(p, score_threshold=0.0).objects for p in predictions]
         self.box_f1_sweep.update(every, targets, batch.scene_id)
 
@@ -120,7 +131,9 @@ class SceneScores(nn.Module):
         if self.accuracy is None or self.box_f1 is None:
             return []
         tables = [
-            metric.rows(per) for metric in (self.accuracy, self.box_f1, self.shape) if metric is not None
+            metric.rows(per)
+            for metric in (self.accuracy, self.box_f1, self.shape, self.atlas)
+            if metric is not None
         ]
         return [{k: v for row in rows for k, v in row.items()} for rows in zip(*tables, strict=True)]
 
@@ -137,4 +150,6 @@ def _plain(value: Any) -> Any:
     """Return ``value`` with tensors turned into numbers."""
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
     return value.item() if hasattr(value, "item") else value
