@@ -26,6 +26,8 @@ from raytran.metrics import (
     Scan2CADAccuracy,
     SceneOccupancyIoU,
 )
+from raytran.metrics.atlas import ErrorAtlas
+from raytran.metrics.curves import AccuracyCurves
 from raytran.metrics.functional.cad_errors import cad_half_extents, cad_symmetries
 from raytran.metrics.records import SceneRecord, decode_records
 from raytran.types import CadAlignments, ObjectSet
@@ -96,6 +98,7 @@ def cads(index: int) -> tuple[CadAlignments | None, CadAlignments]:
 def results(indices: tuple[int, ...], dtype: torch.dtype = torch.float32) -> dict:
     """Everything the metrics return for a share of the scenes, scenes given one by one."""
     of_objects = {"scan2cad": Scan2CADAccuracy(), "box_f1": OrientedBoxF1(), "shape": MatchedShapeScores()}
+    of_objects |= {"curves": AccuracyCurves(), "atlas": ErrorAtlas(volume_extent=(9.0, 9.0, 3.5))}
     truths = [cads(index)[1] for index in range(SCENES)]
     of_cads = {
         "official": Scan2CADAccuracy(protocol="scan2cad", cad_symmetries=cad_symmetries(truths)),
