@@ -62,14 +62,16 @@ class AccuracyCurves(SceneRecordMetric):
     truth_columns = 1 + len(CURVES) * len(FACTORS)
     prediction_columns = 1
 
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self._limits = np.array(_all_limits())
+
     def judge(self, predictions: ObjectSet, targets: ObjectSet) -> tuple[Tensor, Tensor]:
         """Match one scene at all thresholds; see the base class."""
         errors = torch.stack([*alignment_errors(predictions, targets)]).numpy()
         same_class = (predictions.label[:, None] == targets.label).numpy()
-        allowed = [
-            same_class & (errors <= np.array(limits)[:, None, None]).all(axis=0) for limits in _all_limits()
-        ]
-        found = _first_fit(np.stack(allowed), score_order(predictions.score).tolist())
+        within = (errors <= self._limits[:, :, None, None]).all(axis=1)
+        found = _first_fit(same_class & within, score_order(predictions.score).tolist())
         truths = torch.cat([targets.label[:, None].double(), torch.from_numpy(found.T).double()], dim=1)
         return truths, predictions.label[:, None].double()
 

@@ -16,9 +16,10 @@ from rich.console import Console
 from raytran.errors import ConfigError
 from raytran.metrics.records import Row
 from raytran.run.output import check_replaceable, replaced_folder
-from raytran.run.score_files import read_predictions
+from raytran.run.score_files import PredictionFiles, read_predictions
 from raytran.run.score_protocols import (
     ProtocolScores,
+    Truth,
     choose_protocols,
     compare,
     confidence,
@@ -86,18 +87,15 @@ def score_predictions(
     """Score the predictions for many scenes.
 
     Args:
-        predictions: folder of ``<scene_id>.json`` (``raytran.scene/1``; also ``<scene_id>/scene.json``) or
-            ``<scene_id>.csv`` (Scan2CAD, 12 columns), or ROCA's CSV of all scenes.
+        predictions: folder or file, see ``read_predictions``.
         annotations: Scan2CAD's ``full_annotations.json``.
         protocol: ``strict``, ``scan2cad``, ``vid2cad``, ``odam``, or ``all`` of them that apply.
         compare_with: other predictions for the same scenes.
         split: text file of the scenes that were asked for; None: all annotated ones.
-        scans: ScanNet's ``scans`` folder; tells which objects lie outside the voxel grid.
+        scans: ScanNet's ``scans`` folder, whose cameras tell where the voxel grid was.
         volume_extent: size of that grid, metres.
-        output: folder for ``metrics.json``, ``per_object.csv``, ``per_scene.csv`` and ``atlas.json``, which
-            appear together or not at all; None writes nothing.
-        num_resamples: draws of the bootstrap.
-        seed: of the bootstrap.
+        output: folder for the results, which appear together or not at all; None writes nothing.
+        num_resamples: draws of the bootstrap, which ``seed`` makes the same each time.
 
     Returns:
         by protocol what its metric returns and ``confidence`` intervals; ``comparison`` by protocol.
@@ -109,30 +107,30 @@ def score_predictions(
     if output is not None:
         check_replaceable(output.resolve(), marker=MARKER)
     truth = read_truth(annotations, split=split, scans=scans)
-    files = read_predictions(predictions, truth.objects, truth.cad_boxes)
-    protocols = choose_protocols(protocol, files, predictions)
-    metrics: dict[str, Any] = {
-        "predictions": str(predictions),
-        "annotations": str(annotations),
-        "n_scenes_with_predictions": len(files.scenes),
-        "n_scenes_ignored": len(files.ignored),
-        "n_predictions_without_known_cad": sum(scene.n_unknown_cads for scene in files.scenes.values()),
-    }
-    scores: dict[str, ProtocolScores] = {}
+    files, scores = _by_protocol(protocol, predictions, truth, volume_extent)
+    about = {"predictions": str(predictions), "annotations": str(annotations)}
+    metrics: dict[str, Any] = {**about, **files.counts()}
     chance = {"num_resamples": num_resamples, "seed": seed}
-    for name in protocols:
-        scores[name] = score_protocol(name, files, truth, volume_extent=volume_extent)
-        metrics[name] = scores[name].metrics | {"confidence": confidence(scores[name], **chance)}
+    for name, part in scores.items():
+        metrics[name] = part.metrics | {"confidence": confidence(part, **chance)}
     if compare_with is not None:
-        others = read_predictions(compare_with, truth.objects, truth.cad_boxes)
+        others = _by_protocol(protocol, compare_with, truth)[1]
         metrics["comparison"] = {
-            name: compare(scores[name], score_protocol(name, others, truth), **chance)
-            for name in protocols
-            if name in choose_protocols(protocol, others, compare_with)
+            name: compare(part, others[name], **chance) for name, part in scores.items() if name in others
         }
     if output is not None:
         _write(output, metrics, scores)
     return metrics
+
+
+def _by_protocol(
+    protocol: str, path: Path, truth: Truth, volume_extent: Sequence[float] | None = None
+) -> tuple[PredictionFiles, dict[str, ProtocolScores]]:
+    files = read_predictions(path, truth.objects, truth.cad_boxes)
+    return files, {
+        name: score_protocol(name, files, truth, volume_extent=volume_extent)
+        for name in choose_protocols(protocol, files, path)
+    }
 
 
 def _write(output: Path, metrics: Mapping[str, Any], scores: Mapping[str, ProtocolScores]) -> None:

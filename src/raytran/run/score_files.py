@@ -59,6 +59,14 @@ class PredictionFiles:
     scenes: dict[str, ScenePredictions]
     ignored: tuple[str, ...]
 
+    def counts(self) -> dict[str, int]:
+        """Return what was read and what was left out, for ``metrics.json``."""
+        return {
+            "n_scenes_with_predictions": len(self.scenes),
+            "n_scenes_ignored": len(self.ignored),
+            "n_predictions_without_known_cad": sum(scene.n_unknown_cads for scene in self.scenes.values()),
+        }
+
 
 def read_predictions(path: Path, scene_ids: Collection[str], cad_boxes: CadBoxes) -> PredictionFiles:
     """Read the predictions for the scenes asked for.
@@ -89,15 +97,15 @@ def read_predictions(path: Path, scene_ids: Collection[str], cad_boxes: CadBoxes
     if ignored:
         shown = ", ".join(sorted(ignored)[:3]) + (", …" if len(ignored) > 3 else "")
         _log.warning("%s: ignored %d scenes that are not asked for (%s)", path, len(ignored), shown)
-    unknown = sum(scene.n_unknown_cads for scene in scenes.values())
-    if unknown:
+    result = PredictionFiles(scenes, ignored)
+    if unknown := result.counts()["n_predictions_without_known_cad"]:
         _log.warning(
             "%s: %d predictions are left out where the box of their CAD model is needed, since the "
             "annotations do not know that model",
             path,
             unknown,
         )
-    return PredictionFiles(scenes, ignored)
+    return result
 
 
 def _files_by_scene(folder: Path) -> dict[str, Path]:
