@@ -40,9 +40,14 @@ def test_header_and_blank_lines_are_skipped(tmp_path, caplog):
     assert f"{path}, line 1" in caplog.text
 
 
-def test_empty_file_and_numbers_for_categories(tmp_path):
+def test_empty_file(tmp_path):
     assert len(read_alignments_csv(write(tmp_path, ""))) == 0
-    assert read_alignments_csv(write(tmp_path, ROW.removeprefix("0"))).catid == ("03001627",)
+
+
+def test_categories_without_leading_zero_match_nothing(tmp_path, caplog):
+    path = write(tmp_path, ROW, ROW.removeprefix("0"))
+    assert read_alignments_csv(path).catid == ("03001627", "3001627")
+    assert f"{path}, line 2: catid_cad '3001627'" in caplog.text
 
 
 def test_quaternions_are_kept_as_given(tmp_path, caplog):

@@ -28,6 +28,8 @@ ROCA_COLUMNS: tuple[str, ...] = (
 )
 """The 14 columns of ROCA's result file (vid2cad_evaluation.py)."""
 
+_CATID_DIGITS = 8
+
 _UNIT_TOLERANCE = 1e-3
 """Quaternions written with four digits still count as of length one."""
 
@@ -41,8 +43,9 @@ class _Row(NamedTuple):
 def read_alignments_csv(path: Path) -> CadAlignments:
     """Read the predictions for one scan, 12 columns a row; a header row and blank lines are skipped.
 
-    Quaternions are kept as given, but one sentence warns of those not of length one: the official script
-    uses them as they are.
+    Quaternions and categories are kept as given, but one sentence warns of quaternions not of length one and
+    of categories without eight digits: the official script takes them as they are, and the latter match
+    nothing.
 
     Args:
         path: ``<id_scan>.csv``.
@@ -51,11 +54,20 @@ def read_alignments_csv(path: Path) -> CadAlignments:
         DataError: the file cannot be read, or a row has another number of columns, a value that is no
             finite number, a quaternion of length zero or a scale that is not positive.
     """
-    return _alignments(_read_rows(Path(path), SCAN2CAD_COLUMNS, 2))
+    rows = _read_rows(Path(path), SCAN2CAD_COLUMNS, 2)
+    short = [row for row in rows if len(row.names[0]) != _CATID_DIGITS]
+    if short:
+        _log.warning(
+            "%s, line %d: catid_cad %r does not have eight digits (%d such lines) and matches nothing",
+            *(path, short[0].line, short[0].names[0], len(short)),
+        )
+    return _alignments(rows)
 
 
 def read_roca_csv(path: Path) -> dict[str, CadAlignments]:
     """Read the predictions for many scans, 14 columns a row, as ``read_alignments_csv`` does.
+
+    ROCA writes categories as numbers; they get their leading zeros back.
 
     Args:
         path: the file; the rows of a scan need not be neighbours.
@@ -68,7 +80,8 @@ def read_roca_csv(path: Path) -> dict[str, CadAlignments]:
     """
     by_scene: dict[str, list[_Row]] = {}
     for row in _read_rows(Path(path), ROCA_COLUMNS, 3):
-        by_scene.setdefault(row.names[0], []).append(row._replace(names=row.names[1:]))
+        scene_id, category, name = row.names
+        by_scene.setdefault(scene_id, []).append(row._replace(names=[category.zfill(_CATID_DIGITS), name]))
     return {scene_id: _alignments(rows) for scene_id, rows in by_scene.items()}
 
 
@@ -159,7 +172,7 @@ def _alignments(rows: list[_Row]) -> CadAlignments:
     numbers = numbers.reshape(len(rows), len(rows[0].values) if rows else 10)
     scored = numbers.shape[1] > 10
     return CadAlignments(
-        catid=tuple(row.names[0].zfill(8) for row in rows),
+        catid=tuple(row.names[0] for row in rows),
         id_cad=tuple(row.names[1] for row in rows),
         translation=numbers[:, :3],
         quaternion=numbers[:, 3:7],

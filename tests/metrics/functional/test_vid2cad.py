@@ -75,7 +75,8 @@ def without_duplicates(scene, rows):
                 continue
             near = np.linalg.norm(a[2] - b[2]) <= 0.4 and abs(np.mean(a[4] / b[4]) - 1) <= 0.6
             turns = COMB[symmetry_of(scene, a)]
-            if near and least_angle(a[3].astype(float), b[3].astype(float), turns) <= 60:
+            p, q = ((row[3] / np.linalg.norm(row[3])).astype(float) for row in (a, b))  # here alone
+            if near and least_angle(q, p, turns) <= 60:
                 dead.add(j)
     return [row for i, row in enumerate(rows) if i not in dead]
 
@@ -94,6 +95,7 @@ def hits(scene, rows):
         quota[catid] -= 1
         for model in models:
             t_gt, q_gt, s_gt = taken_apart(to_scan @ matrix_of(model["trs"]))
+            t_gt, s_gt = np.float32(t_gt), np.float32(s_gt)
             turns = COMB[model["sym"]] if symmetry_of(scene, row) == model["sym"] else 1
             if (
                 model["catid_cad"] == catid
@@ -168,6 +170,13 @@ def test_duplicates_are_removed_before_the_cap():
     # Without removal the second row would use up the cap, and the third would not be tried.
     result = evaluate({"a": truth}, {"a": models(CHAIR, [0.0, 0.3, 1.0], [0.9, 0.8, 0.7])})
     assert result["n_good"] == 2
+
+
+def test_duplicates_are_sought_with_quaternions_of_length_one():
+    """Taken as they are, one shorter than one would be 2 acos 0.49 = 121 degrees away and both be kept."""
+    short = models(CHAIR, [0.0, 0.3, 1.0], [0.9, 0.8, 0.7])
+    short = replace(short, quaternion=short.quaternion * torch.tensor([[1.0], [0.49], [1.0]]).double())
+    assert evaluate({"a": models(CHAIR, [0.0, 1.0])}, {"a": short})["n_good"] == 2
 
 
 def test_the_cap_is_used_up_by_misses():

@@ -17,7 +17,11 @@ _COMB = 36
 
 
 def cad_errors(
-    predictions: CadAlignments, targets: CadAlignments, target_point: Tensor, symmetry: Tensor
+    predictions: CadAlignments,
+    targets: CadAlignments,
+    target_point: Tensor,
+    symmetry: Tensor,
+    dtype: torch.dtype = torch.float64,
 ) -> AlignmentErrors:
     """Return the three errors of every prediction against every true model.
 
@@ -28,13 +32,14 @@ def cad_errors(
         targets: of the same scene.
         target_point: ``(M, 3)`` what the predicted translation is compared with, metres.
         symmetry: ``(P, M)`` int64, over whose turns the rotation error is the least.
+        dtype: precision in which translation and scale are compared.
     """
-    shift = predictions.translation[:, None] - target_point
+    shift = predictions.translation.to(dtype)[:, None] - target_point.to(dtype)
     x, y, z = (shift * shift).unbind(dim=-1)
-    first, second, third = (predictions.scale[:, None] / targets.scale).unbind(dim=-1)
+    first, second, third = (predictions.scale.to(dtype)[:, None] / targets.scale.to(dtype)).unbind(dim=-1)
     scale = ((first + second + third) / 3 - 1).abs()
     rotation = comb_rotation_error(predictions.quaternion, targets.quaternion, symmetry)
-    return AlignmentErrors((x + y + z).sqrt(), rotation, scale)
+    return AlignmentErrors((x + y + z).sqrt().double(), rotation, scale.double())
 
 
 def comb_rotation_error(predicted: Tensor, target: Tensor, symmetry: Tensor) -> Tensor:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from raytran.errors import ShapeError
 from raytran.metrics.functional.alignment import AlignmentErrors
-from raytran.metrics.functional.cad_errors import cad_errors, comb_rotation_error, equal_names
+from raytran.metrics.functional.cad_errors import cad_errors, equal_names
 from raytran.metrics.functional.matching import match_in_order
 from raytran.types import CLASS_BY_CATID, CadAlignments
 
@@ -28,8 +28,9 @@ def match_vid2cad(
     """Give each prediction that is kept, by score, the first free model of its category that it fits.
 
     - Models and predictions of other categories than the nine match nothing.
-    - Predicted values are rounded to float32.
-    - A prediction that is close to a better one of its category is a duplicate and left out.
+    - Predicted values are rounded to float32, and translations and scales are compared in it.
+    - A prediction that is close to a better one of its category is a duplicate and left out; for this alone
+      quaternions are brought to length one.
     - Of each category the best are kept, as many as stand in the scene; they use that up matched or not.
     - The symmetry counts only if the predicted CAD model has the same one as the true model. It is looked up
       in the scene; a CAD model that is not there, at which the script fails, has none.
@@ -53,7 +54,7 @@ def match_vid2cad(
         known.setdefault(name, value)
     symmetry = torch.tensor([known.get(name, 1) for name in rounded.model_id], dtype=torch.int64)
     shared = torch.where(symmetry[:, None] == targets.symmetry, targets.symmetry, 1)
-    errors = cad_errors(rounded, targets, targets.translation, shared)
+    errors = cad_errors(rounded, targets, targets.translation, shared, torch.float32)
     order = rounded.score.argsort(descending=True, stable=True)
     kept = _kept(rounded.select(order), symmetry[order], Counter(targets.catid))
     named = torch.tensor([catid in VID2CAD_CLASS_BY_CATID for catid in targets.catid], dtype=torch.bool)
@@ -84,10 +85,8 @@ def _kept(ranked: CadAlignments, symmetry: Tensor, left: Counter[str]) -> Tensor
 
 def _close(ranked: CadAlignments, symmetry: Tensor) -> Tensor:
     """Return whether the second is a duplicate of the first, ``(P, P)``, by the symmetry of the first."""
-    translation, scale = ranked.translation.float(), ranked.scale.float()  # the script's own precision
-    distance = (translation[:, None] - translation).square().sum(dim=-1).sqrt().double()
-    ratio = ((scale[:, None] / scale).mean(dim=-1) - 1).abs().double()
-    turn = symmetry.expand(len(ranked), -1)  # the first is in the place of the true model
-    angle = comb_rotation_error(ranked.quaternion, ranked.quaternion, turn).T
-    same = equal_names(ranked.catid, ranked.catid)
-    return same & AlignmentErrors(distance, angle, ratio).within(*_DUPLICATE_LIMITS)
+    unit = torch.nn.functional.normalize(ranked.quaternion.float(), dim=-1).double()
+    turned = replace(ranked, quaternion=unit)
+    turns = symmetry[:, None].expand(-1, len(ranked))
+    errors = cad_errors(turned, turned, ranked.translation, turns, torch.float32)
+    return equal_names(ranked.catid, ranked.catid) & errors.within(*_DUPLICATE_LIMITS)
