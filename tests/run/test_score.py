@@ -10,6 +10,7 @@ import subprocess
 import sys
 
 import pytest
+from PIL import Image
 
 from raytran.errors import ConfigError, DataError
 from raytran.run.entry import compose
@@ -207,6 +208,38 @@ def test_comparison(files):
     assert not found["strict"]["global_average"]["significant"]
     assert found["odam"]["f1_0.5"]["first"] == pytest.approx(2 * 2 / (2 + 2))  # scene a alone counts for both
     assert found["odam"]["f1_0.5"]["second"] == pytest.approx(2 * 1 / (1 + 2))
+
+
+def test_one_csv_with_scores_of_all_scenes(files):
+    # The worse chair has the higher score: it takes the category's only place, and its error is 0.5 m.
+    lines = [
+        row(f"a,{CHAIR}", "c1", (0, 0, 0)),
+        row(f"a,{CHAIR}", "c1", (0.5, 0, 0)),
+        row("x,1", "y", (0, 0, 0)),
+    ]
+    scores = [0.5, 0.9, 0.9]
+    text = "".join(f"{line.strip()},{score}\n" for line, score in zip(lines, scores, strict=True))
+    (files / "roca.csv").write_text(text)
+    found = run(files, "protocol=all", predictions="roca.csv")
+    assert counts(found["vid2cad"]) == {"chair": (0, 2), "table": (0, 1)}
+    assert counts(found["strict"])["chair"] == (1, 2)
+    assert found["n_scenes_ignored"] == 1
+
+
+def test_cameras_tell_what_lies_outside_the_volume(files):
+    for name, x in (("a", -3.0), ("b", 0.0), ("c", 6.0)):
+        scan = files / "scans" / name
+        for part in ("color", "pose", "intrinsic"):
+            (scan / part).mkdir(parents=True)
+        Image.new("RGB", (32, 24)).save(scan / "color" / "0.jpg")
+        (scan / "pose" / "0.txt").write_text(f"1 0 0 {x}\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+        (scan / "intrinsic" / "intrinsic_color.txt").write_text("30 0 16 0\n0 30 12 0\n0 0 1 0\n0 0 0 1\n")
+    atlas = run(files, f"scans={files / 'scans'}")["strict"]["atlas"]["objects"]
+    # The grid reaches 4.5 m: the chair of c at x = 1 lies outside, the sofa of b inside. Found stays found.
+    assert (atlas["outside the volume"], atlas["missed"], atlas["found"]) == (1, 1, 3)
+    (files / "scans" / "c" / "pose" / "0.txt").unlink()
+    with pytest.raises(DataError):
+        run(files, f"scans={files / 'scans'}")
 
 
 def test_split_names_the_scenes(files):

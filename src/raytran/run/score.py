@@ -94,22 +94,22 @@ def score_predictions(
         split: text file of the scenes that were asked for; None: all annotated ones.
         scans: ScanNet's ``scans`` folder, whose cameras tell where the voxel grid was.
         volume_extent: size of that grid, metres.
-        output: folder for the results, which appear together or not at all; None writes nothing.
-        num_resamples: draws of the bootstrap, which ``seed`` makes the same each time.
+        output: folder for the results, which appear together or not at all, or None.
+        num_resamples: draws of the bootstrap.
+        seed: of the bootstrap.
 
     Returns:
         by protocol what its metric returns and ``confidence`` intervals; ``comparison`` by protocol.
 
     Raises:
-        ConfigError: the protocol is unknown or does not go with the predictions, or ``output`` is in use.
+        ConfigError: the protocol is unknown or does not fit the predictions, or ``output`` is in use.
         DataError: a file is missing or damaged.
     """
     if output is not None:
         check_replaceable(output.resolve(), marker=MARKER)
     truth = read_truth(annotations, split=split, scans=scans)
     files, scores = _by_protocol(protocol, predictions, truth, volume_extent)
-    about = {"predictions": str(predictions), "annotations": str(annotations)}
-    metrics: dict[str, Any] = {**about, **files.counts()}
+    metrics = {"predictions": str(predictions), "annotations": str(annotations), **files.counts()}
     chance = {"num_resamples": num_resamples, "seed": seed}
     for name, part in scores.items():
         metrics[name] = part.metrics | {"confidence": confidence(part, **chance)}
