@@ -93,7 +93,7 @@ class OrientedBoxF1(SceneRecordMetric):
         self.cad_half_extents = None if cad_half_extents is None else dict(cad_half_extents)
         self.iou_thresholds = tuple(iou_thresholds)
         # Label; of an object the highest IoU with a prediction of its class, of a prediction the score; then
-        # whether it is matched, or how often, at each threshold.
+        # whether it is matched, or how often, at each threshold. An object with label -1 does not count.
         self.truth_columns = self.prediction_columns = 2 + len(self.iou_thresholds)
 
     def judge(
@@ -115,19 +115,21 @@ class OrientedBoxF1(SceneRecordMetric):
     def _judge_cads(self, predictions: CadAlignments, targets: CadAlignments) -> tuple[Tensor, Tensor]:
         known = cad_half_extents([targets]) if self.cad_half_extents is None else self.cad_half_extents
         predicted_corners, predictions = odam_predicted_boxes(predictions, known)
-        true_corners, targets = odam_true_boxes(targets)
-        label, true_label = _labels(predictions), _labels(targets)
+        true_corners, counted = odam_true_boxes(targets)
+        label, true_label = _labels(predictions), _labels(targets)[counted]
         iou = bev_iou(predicted_corners, true_corners)
         iou = torch.where(label[:, None] == true_label, iou, 0.0)
         order = score_order(predictions.score)
         taken = [label.double(), predictions.score]
-        truths = [true_label.double(), torch.cat([iou, iou.new_zeros(1, len(targets))]).amax(dim=0)]
+        truths = [true_label.double(), torch.cat([iou, iou.new_zeros(1, len(true_label))]).amax(dim=0)]
         for threshold in self.iou_thresholds:
             above = (iou > threshold)[order]
             first = above & (above.cumsum(dim=0) == 1)  # each object goes to the first that overlaps it
             taken.append(torch.zeros(len(label)).double().index_copy(0, order, first.sum(dim=1).double()))
             truths.append(first.any(dim=0).double())
-        return torch.stack(truths, dim=-1), torch.stack(taken, dim=-1)
+        every = torch.full((len(targets), self.truth_columns), -1.0, dtype=torch.float64)
+        every[counted] = torch.stack(truths, dim=-1)
+        return every, torch.stack(taken, dim=-1)
 
     def _judge_objects(self, predictions: ObjectSet, targets: ObjectSet) -> tuple[Tensor, Tensor]:
         boxes_a = OrientedBoxes(predictions.center, predictions.size, predictions.rotation)
@@ -151,7 +153,7 @@ class OrientedBoxF1(SceneRecordMetric):
         scenes = self.scenes()
         empty = torch.zeros(0, self.prediction_columns, dtype=torch.float64)
         predictions = torch.cat([empty, *(scene.predictions for scene in scenes)])
-        truths = torch.cat([empty, *(scene.truths for scene in scenes)])
+        truths = torch.cat([empty, *(_counted(scene.truths) for scene in scenes)])
         per_threshold = {
             f"{threshold:g}": self._scores_at(column, predictions, truths[:, 0])
             for column, threshold in enumerate(self.iou_thresholds, start=2)
@@ -185,6 +187,8 @@ class OrientedBoxF1(SceneRecordMetric):
         """Return each object's highest IoU with a prediction of its class, and whether it is matched."""
         rows: list[Row] = []
         for index, (label, best, *matched) in enumerate(record.truths.tolist()):
+            if label < 0:
+                continue
             row: Row = {"scene_id": record.scene_id, "object": index, "category": CLASSES[int(label)]}
             rows.append(
                 row | {"best_iou": best} | self._by_threshold("matched", [bool(value) for value in matched])
@@ -193,8 +197,9 @@ class OrientedBoxF1(SceneRecordMetric):
 
     def scene_row(self, record: SceneRecord) -> Row:
         """Return the counts of one scene."""
-        counts: Row = {"n_predicted": len(record.predictions), "n_true": len(record.truths)}
-        matched = record.truths[:, 2:].sum(dim=0).long().tolist()
+        truths = _counted(record.truths)
+        counts: Row = {"n_predicted": len(record.predictions), "n_true": len(truths)}
+        matched = truths[:, 2:].sum(dim=0).long().tolist()
         return {"scene_id": record.scene_id, **counts, **self._by_threshold("n_matched", matched)}
 
     def _by_threshold(self, name: str, values: Sequence[int]) -> Row:
@@ -202,6 +207,11 @@ class OrientedBoxF1(SceneRecordMetric):
             f"{name}_{threshold:g}": value
             for threshold, value in zip(self.iou_thresholds, values, strict=True)
         }
+
+
+def _counted(truths: Tensor) -> Tensor:
+    """Return the rows of the objects that count."""
+    return truths[truths[:, 0] >= 0]
 
 
 def _labels(alignments: CadAlignments) -> Tensor:

@@ -245,6 +245,12 @@ def test_one_prediction_takes_several_objects(make_benchmark, tmp_path):
     assert (scores["n_matched"], scores["n_predicted"], scores["n_true"]) == (2, 1, 2)
     assert scores["best"]["n_matched"] == 2
     assert 0 <= scores["average_precision"] <= 1
+    metric = OrientedBoxF1(protocol="odam")
+    metric.update([one], [truth.select(torch.tensor([3, 2, 1]))], ["a"])
+    assert [(row["object"], row["category"], row["matched_0.5"]) for row in metric.rows()] == [
+        (2, "chair", True)
+    ]
+    assert metric.rows("scene")[0]["n_true"] == 1
     # A lamp is no prediction; the empty scene and not the missing one counts.
     for prediction, n_true in ((lamp, 2), (CadAlignments.empty(), 2), (None, 0)):
         scores = evaluate({"a": truth}, {"a": prediction})["per_threshold"]["0.5"]

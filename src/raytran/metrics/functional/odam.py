@@ -20,8 +20,8 @@ _SIGNS = torch.tensor(
 """The corners of a box in the script's order, the upper face first; +Y is up."""
 
 
-def odam_true_boxes(targets: CadAlignments) -> tuple[Tensor, CadAlignments]:
-    """Return the corners of the annotated boxes that the script counts, and the models they belong to.
+def odam_true_boxes(targets: CadAlignments) -> tuple[Tensor, Tensor]:
+    """Return the corners of the annotated boxes that the script counts, and which models they belong to.
 
     Only the eight classes with a name, and no model with a scale below 0.001. The box sits on the CAD's
     origin: the script does not know the centre. The scan's ``axisAlignment``, a turn about z and a shift of
@@ -31,7 +31,7 @@ def odam_true_boxes(targets: CadAlignments) -> tuple[Tensor, CadAlignments]:
         targets: the annotated models of one scene.
 
     Returns:
-        ``(M', 8, 3)`` in the scan, metres, and the M' models.
+        ``(M', 8, 3)`` in the scan, metres, and ``(M,)`` bool, whether a model is among the M'.
 
     Raises:
         ShapeError: ``targets`` lacks what annotations have.
@@ -40,7 +40,7 @@ def odam_true_boxes(targets: CadAlignments) -> tuple[Tensor, CadAlignments]:
         raise ShapeError("protocol odam needs the pose, the box and the scale of the annotated models")
     keep = _named(targets) & (targets.annotated_scale.amin(dim=-1) >= _SMALLEST_SCALE)
     pose, half, scale = targets.pose[keep], targets.half_extent[keep], targets.annotated_scale[keep]
-    return _corners(pose[:, :3, :3] / scale[:, None], pose[:, :3, 3], half * scale), targets.select(keep)
+    return _corners(pose[:, :3, :3] / scale[:, None], pose[:, :3, 3], half * scale), keep
 
 
 def odam_predicted_boxes(
