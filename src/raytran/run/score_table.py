@@ -6,11 +6,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from rich import box
 from rich.markup import escape
 from rich.table import Table
 
 from raytran.run.score_protocols import PROTOCOLS
 
+_PLAIN: dict[str, Any] = {"box": box.SIMPLE_HEAD, "pad_edge": False, "collapse_padding": True}
 _CAPTION = escape("[low–high]: 95 % of bootstrap draws of the scenes")
 _AVERAGES = {"class_average": "mean of classes", "global_average": "all objects"}
 _DETECTION = {
@@ -30,7 +32,7 @@ def scores_table(metrics: Mapping[str, Any], *, title: str) -> Table:
     """
     names = [name for name in PROTOCOLS if name in metrics]
     parts = [metrics[name] for name in names]
-    table = Table("", *names, title=escape(title), caption=_CAPTION)
+    table = Table("", *names, title=escape(title), caption=_CAPTION, **_PLAIN)
     table.add_row("scenes", *(str(part["n_scenes"]) for part in parts))
     table.add_section()
     classes = dict.fromkeys(
@@ -78,7 +80,7 @@ def _interval(part: Mapping[str, Any], number: str) -> str:
 def atlas_table(atlas: Mapping[str, Any]) -> Table:
     """Return why objects were missed under protocol ``strict``, by class, with the causes that occur."""
     causes = [cause for cause, count in atlas["objects"].items() if count]
-    table = Table("class", *causes, title="error atlas (strict): annotated objects by cause")
+    table = Table("class", *causes, title="error atlas (strict)", **_PLAIN)
     for category, counts in atlas["per_class"].items():
         if any(counts.values()):
             table.add_row(category, *(str(counts[cause]) for cause in causes))
@@ -89,10 +91,9 @@ def atlas_table(atlas: Mapping[str, Any]) -> Table:
 
 def comparison_table(comparison: Mapping[str, Any], first: str, second: str) -> Table:
     """Return the differences of two sets of predictions on the scenes that count for both."""
-    columns = ("protocol", "number", "first", "second", "difference", "95 % interval", "p")
-    table = Table(
-        *columns, title=escape(f"{first} against {second}"), caption="p: permutation test over scenes"
-    )
+    columns = ("protocol", "", "first", "second", "difference", "p")
+    table = Table(*columns, title=escape(f"first: {first}, second: {second}"), **_PLAIN)
+    table.caption = "p: permutation test over scenes, * below 0.05"
     for row in _comparison_rows(comparison):
         table.add_row(*row)
     return table
@@ -103,9 +104,9 @@ def _comparison_rows(comparison: Mapping[str, Any]) -> Iterator[tuple[str, ...]]
         for number, entry in numbers.items():
             yield (
                 protocol,
-                number,
+                _AVERAGES.get(number, number.replace("f1_", "F1 @ ")),
                 *(f"{entry[side]:.1%}" for side in ("first", "second")),
-                f"{entry['difference']:+.1%}",
-                f"{entry['low']:+.1%} – {entry['high']:+.1%}",
+                f"{entry['difference']:+.1%} "
+                + escape(f"[{100 * entry['low']:+.1f}, {100 * entry['high']:+.1f}]"),
                 f"{entry['p_value']:.3f}" + (" *" if entry["significant"] else ""),
             )
