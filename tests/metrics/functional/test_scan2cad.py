@@ -227,6 +227,16 @@ def test_symmetry_is_that_of_the_predicted_model_and_the_last_annotation_wins():
         assert evaluate(truths, {name: half_turn for name in order}).compute()["n_good"] == n_good
 
 
+def test_two_kinds_of_other_do_not_match():
+    """A lamp predicted where a bed stands; another lamp in the scene lets it be tried."""
+    far = torch.tensor([[0.0, 0, 0], [9.0, 0, 0]]).double()
+    truth = chairs(2, catid=("02818832", "03636649"), translation=far, id_cad=("bed", "lamp"))
+    truth = replace(truth, pose=truth.pose + torch.nn.functional.pad(far[..., None], (3, 0, 0, 1)))
+    lamp = chairs(1, catid=("03636649",), id_cad=("lamp",))
+    assert evaluate({"a": truth}, {"a": lamp}).compute()["n_good"] == 0
+    assert evaluate({"a": truth}, {"a": replace(lamp, translation=far[1:])}).compute()["n_good"] == 1
+
+
 def test_infinite_symmetry_is_a_comb_of_ten_degrees():
     turned = torch.tensor(
         [about_own_y([1.0, 0, 0, 0], degrees) for degrees in (0, 5, 10, 177)], dtype=torch.float64

@@ -198,6 +198,11 @@ def test_beds_are_a_class_and_lamps_are_not():
     result = evaluate(truths, truths)
     assert result["per_class"]["bed"]["n_good"] == result["n_good"] == result["n_total"] == 1
     assert result["benchmark_global_average"] == 0
+    metric = Scan2CADAccuracy(protocol="vid2cad")
+    metric.update([truths["b"]], [truths["b"]], ["b"])
+    assert metric.rows("object") == []
+    row = metric.rows("scene")[0]
+    assert (row["n_good"], row["n_total"], row["n_predicted"]) == (0, 0, 1)
 
 
 def test_scenes_without_rows_add_only_classes_seen_elsewhere():
