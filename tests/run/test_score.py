@@ -260,7 +260,7 @@ def test_what_is_unknown_is_counted(files, caplog):
     assert found["n_predictions_without_known_cad"] == 1
     assert detection(found["strict"], "0.5") == [3, 3, 5]
     assert "nowhere" in caplog.text
-    assert "1 predictions are left out" in caplog.text
+    assert "do not know the CAD model of 1 predictions" in caplog.text
 
 
 def test_a_quaternion_of_any_length_is_a_rotation(files):
@@ -269,10 +269,16 @@ def test_a_quaternion_of_any_length_is_a_rotation(files):
     assert counts(run(files)["strict"])["chair"] == (1, 2)
 
 
-def test_header_row(files):
+def test_the_folder_of_one_predicted_scene(files):
+    (files / "one").mkdir()
+    (files / "one" / "scene.json").write_text(scene_json("a", box("chair", [0, 0, 0.25], [0.5, 1, 0.5])))
+    assert counts(run(files, predictions="one")["strict"])["chair"] == (1, 2)
+
+
+def test_header_row_and_empty_line(files):
     expected = run(files)["strict"]
     header = "catid_cad,id_cad,tx,ty,tz,qw,qx,qy,qz,sx,sy,sz\n"
-    (files / "csv" / "a.csv").write_text(header + "".join(ROWS))
+    (files / "csv" / "a.csv").write_text(header + "\n".join(ROWS))
     assert run(files)["strict"] == expected
 
 
@@ -309,6 +315,8 @@ def test_bad_settings(files):
         evaluate(compose("evaluate", []))
     with pytest.raises(ConfigError, match="needs annotations=FILE"):
         evaluate(compose("evaluate", [f"predictions={files}"]))
+    with pytest.raises(ConfigError, match="num_resamples=0 is too few"):
+        run(files, "num_resamples=0")
     with pytest.raises(DataError, match="no predictions at"):
         run(files, predictions="nothing")
     (files / "empty").mkdir()

@@ -45,6 +45,8 @@ def score(cfg: DictConfig) -> dict[str, Any]:
     """
     if cfg.annotations is None:
         raise ConfigError("predictions= needs annotations=FILE, Scan2CAD's full_annotations.json")
+    if cfg.num_resamples < 1:
+        raise ConfigError(f"num_resamples={cfg.num_resamples} is too few, give at least 1")
 
     def path(name: str) -> Path | None:
         return None if cfg[name] is None else Path(cfg[name])

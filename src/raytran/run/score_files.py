@@ -73,7 +73,8 @@ def read_predictions(path: Path, scene_ids: Collection[str], cad_boxes: CadBoxes
 
     Args:
         path: a folder of ``<scene_id>.json`` or ``<scene_id>/scene.json`` (``raytran.scene/1``) or
-            ``<scene_id>.csv`` (Scan2CAD, 12 columns); or a CSV of ROCA's 14 columns with all scenes.
+            ``<scene_id>.csv`` (Scan2CAD, 12 columns); or the folder of one scene, with its ``scene.json``;
+            or a CSV of ROCA's 14 columns with all scenes.
         scene_ids: the annotated scenes; others are ignored, without being opened.
         cad_boxes: of the CAD models that the annotations name.
 
@@ -100,8 +101,8 @@ def read_predictions(path: Path, scene_ids: Collection[str], cad_boxes: CadBoxes
     result = PredictionFiles(scenes, ignored)
     if unknown := result.counts()["n_predictions_without_known_cad"]:
         _log.warning(
-            "%s: %d predictions are left out where the box of their CAD model is needed, since the "
-            "annotations do not know that model",
+            "%s: the annotations do not know the CAD model of %d predictions: where its box is needed "
+            "(strict and odam for a CSV, scan2cad and vid2cad for a JSON file), they find nothing",
             path,
             unknown,
         )
@@ -118,6 +119,8 @@ def _files_by_scene(folder: Path) -> dict[str, Path]:
         if entry.name.startswith(".") or path.suffix not in (".json", ".csv") or not path.is_file():
             continue
         name = entry.name if entry.is_dir() else entry.stem
+        if entry.name == "scene.json":  # the folder is one that raytran.predict has written for one scene
+            name = read_scene_json(entry).scene_id
         if name in files:
             raise DataError(f"{files[name]} and {path} both hold scene {name}: delete one of them")
         files[name] = path
