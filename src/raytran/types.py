@@ -18,6 +18,7 @@ ShapeNet's frame (+Y up, front -Z). ``CONVENTIONS.md`` says all of this at lengt
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
@@ -25,17 +26,21 @@ import torch
 from torch import Tensor
 
 CLASSES: tuple[str, ...] = (
-    "bathtub",
-    "bookshelf",
-    "cabinet",
-    "chair",
-    "display",
-    "sofa",
-    "table",
-    "trashbin",
-    "other",
+    *("bathtub", "bookshelf", "cabinet", "chair", "display", "sofa", "table", "trashbin", "other"),
 )
 """Class names in the order of their labels; a network adds the padding class behind them (RayTran §3.2)."""
+
+CLASS_BY_CATID: dict[str, str] = {
+    "02808440": "bathtub",
+    "02871439": "bookshelf",
+    "02933112": "cabinet",
+    "03001627": "chair",
+    "03211117": "display",
+    "04256520": "sofa",
+    "04379243": "table",
+    "02747177": "trashbin",
+}
+"""Class of each ShapeNet category (Scan2CAD EvaluateBenchmark.py); every other category is ``other``."""
 
 CLASS_COLORS: tuple[tuple[int, int, int], ...] = (
     (23, 190, 207),
@@ -68,23 +73,30 @@ class Parcel:
 
     def to(self: _Parcel, device: torch.device | str, *, non_blocking: bool = False) -> _Parcel:
         """Return a copy with every tensor inside on ``device``."""
-
-        def move(value: Any) -> Any:
-            if isinstance(value, Tensor | Parcel):
-                return value.to(device, non_blocking=non_blocking)
-            return tuple(move(item) for item in value) if isinstance(value, tuple) else value
-
-        return replace(self, **{field.name: move(getattr(self, field.name)) for field in fields(self)})
+        return self._map(lambda item: item.to(device, non_blocking=non_blocking))
 
     def pin_memory(self: _Parcel) -> _Parcel:
         """Return a copy with every tensor inside in page-locked memory (called by ``DataLoader``)."""
+        return self._map(lambda item: item.pin_memory())
 
-        def pin(value: Any) -> Any:
+    def _map(self: _Parcel, change: Callable[[Any], Any]) -> _Parcel:
+        def visit(value: Any) -> Any:
             if isinstance(value, Tensor | Parcel):
-                return value.pin_memory()
-            return tuple(pin(item) for item in value) if isinstance(value, tuple) else value
+                return change(value)
+            return tuple(visit(item) for item in value) if isinstance(value, tuple) else value
 
-        return replace(self, **{field.name: pin(getattr(self, field.name)) for field in fields(self)})
+        return replace(self, **{field.name: visit(getattr(self, field.name)) for field in fields(self)})
+
+    def _select(self: _Parcel, count: int, index: Tensor) -> _Parcel:
+        """Return rows of a parcel whose fields all have ``count`` rows, or none."""
+        chosen = torch.arange(count, device=index.device)[index].tolist()
+
+        def pick(value: Any) -> Any:
+            if isinstance(value, tuple):
+                return tuple(value[i] for i in chosen) if value else ()
+            return None if value is None else value[index]
+
+        return replace(self, **{field.name: pick(getattr(self, field.name)) for field in fields(self)})
 
 
 @dataclass(frozen=True)
@@ -140,17 +152,7 @@ class ObjectSet(Parcel):
 
     def select(self, index: Tensor) -> ObjectSet:
         """Return the objects at ``index``, an int64 ``(M',)`` or bool ``(M,)`` tensor, in that order."""
-        chosen = torch.arange(len(self), device=index.device)[index].tolist()
-        return ObjectSet(
-            label=self.label[index],
-            center=self.center[index],
-            size=self.size[index],
-            rotation=self.rotation[index],
-            symmetry=self.symmetry[index],
-            score=self.score[index],
-            shape=None if self.shape is None else self.shape[index],
-            model_id=tuple(self.model_id[i] for i in chosen) if self.model_id else (),
-        )
+        return self._select(len(self), index)
 
     @staticmethod
     def empty() -> ObjectSet:
@@ -158,6 +160,63 @@ class ObjectSet(Parcel):
         none = torch.zeros(0, dtype=torch.int64)
         vectors = torch.zeros(0, 3)
         return ObjectSet(none, vectors, vectors, torch.zeros(0, 3, 3), none, torch.zeros(0))
+
+
+@dataclass(frozen=True)
+class CadAlignments(Parcel):
+    """The ``M`` CAD models that stand in one scan, true or predicted, in the order of their file.
+
+    A point of ShapeNet's ``model_normalized.obj`` goes to ``translation + R(quaternion) · (scale · point)``
+    in the scan, the world of its poses. Numbers are float64.
+
+    Attributes:
+        catid: ShapeNet category of each model, eight digits.
+        id_cad: name of each model within its category.
+        translation: ``(M, 3)`` where the CAD's origin stands, metres.
+        quaternion: ``(M, 4)`` [w, x, y, z] as given, of any length and either sign.
+        scale: ``(M, 3)`` metres per CAD unit.
+        score: ``(M,)`` confidence; ones for ground truth.
+        half_extent: ``(M, 3)`` half the size of the CAD's box, CAD units; None for predictions without boxes.
+        center: ``(M, 3)`` centre of the CAD's box, CAD units; None for predictions.
+        symmetry: ``(M,)`` int64 as in ``ObjectSet``; None for predictions.
+        pose: ``(M, 4, 4)`` scan_from_cad as annotated; None for predictions.
+        annotated_scale: ``(M, 3)`` scale as annotated, of either sign; None for predictions.
+    """
+
+    catid: tuple[str, ...]
+    id_cad: tuple[str, ...]
+    translation: Tensor
+    quaternion: Tensor
+    scale: Tensor
+    score: Tensor
+    half_extent: Tensor | None = None
+    center: Tensor | None = None
+    symmetry: Tensor | None = None
+    pose: Tensor | None = None
+    annotated_scale: Tensor | None = None
+
+    def __len__(self) -> int:
+        return len(self.catid)
+
+    @property
+    def model_id(self) -> tuple[str, ...]:
+        """``catid/id`` of each model."""
+        return tuple(f"{catid}/{name}" for catid, name in zip(self.catid, self.id_cad, strict=True))
+
+    @property
+    def category(self) -> tuple[str, ...]:
+        """Class of each model."""
+        return tuple(CLASS_BY_CATID.get(catid, "other") for catid in self.catid)
+
+    def select(self, index: Tensor) -> CadAlignments:
+        """Return the models at ``index``, an int64 ``(M',)`` or bool ``(M,)`` tensor, in that order."""
+        return self._select(len(self), index)
+
+    @staticmethod
+    def empty() -> CadAlignments:
+        """Return the predictions of a scene in which nothing was found."""
+        none = torch.zeros(0, 10, dtype=torch.float64)
+        return CadAlignments((), (), none[:, :3], none[:, :4], none[:, :3], none[:, 0])
 
 
 @dataclass(frozen=True)

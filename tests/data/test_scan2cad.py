@@ -10,9 +10,14 @@ import math
 import pytest
 import torch
 
-from raytran.data.scan2cad import read_annotations, scene_objects
+from raytran.data.scan2cad import read_annotations, scene_alignments, scene_objects
 from raytran.errors import DataError
-from raytran.geometry.rotation import geodesic_angle, rotation_from_yaw, yaw_from_rotation
+from raytran.geometry.rotation import (
+    geodesic_angle,
+    matrix_from_quaternion,
+    rotation_from_yaw,
+    yaw_from_rotation,
+)
 from raytran.types import CLASSES, SYMMETRY_INFINITE
 
 
@@ -132,3 +137,25 @@ def test_real_annotation(shared_dir) -> None:
     corners = (signs * objects.size[:, None]) @ objects.rotation.mT + objects.center[:, None]
     true_corners = torch.tensor([o["corners"] for o in expected])
     assert torch.cdist(corners, true_corners).amin(dim=-1).max() < 1e-3
+
+
+def test_alignments_are_the_poses_taken_apart(shared_dir) -> None:
+    path = shared_dir / "realdata" / "scene0470_00" / "scan2cad" / "full_annotations.json"
+    annotation = read_annotations(path)["scene0470_00"]
+    alignments, objects = scene_alignments(annotation), scene_objects(annotation)
+    turned = matrix_from_quaternion(alignments.quaternion) * alignments.scale[:, None]
+    torch.testing.assert_close(turned, annotation.scan_from_cad[:, :3, :3], atol=1e-12, rtol=0)
+    centre = alignments.translation + (turned @ alignments.center[..., None])[..., 0]
+    torch.testing.assert_close(centre.float(), objects.center)
+    torch.testing.assert_close((2 * alignments.half_extent * alignments.scale).float(), objects.size)
+    assert alignments.model_id == objects.model_id
+    assert alignments.category == tuple(CLASSES[label] for label in objects.label.tolist())
+    assert alignments.symmetry.tolist() == [2, 1, 1, 1, 1, SYMMETRY_INFINITE, 1]
+
+
+def test_alignments_keep_what_is_degenerate(write_annotations, cube_entry) -> None:
+    path = write_annotations({"scene0000_00": [cube_entry(scale=(1.0, 0.0, 1.0)), cube_entry()]})
+    alignments = scene_alignments(read_annotations(path)["scene0000_00"])
+    assert len(alignments) == 2
+    assert alignments.quaternion.isnan().all(dim=1).tolist() == [True, False]
+    assert alignments.annotated_scale.tolist() == [[1, 0, 1], [1, 1, 1]]

@@ -157,9 +157,12 @@ def make_pair(kind: str, rng: np.random.Generator) -> tuple[Box, Box]:
         ),
         "perm_90": lambda: (a, moved(a, near / 8, rotation=a[2] @ np.eye(3)[[1, 2, 0]] @ a[2].T)),
         "near_parallel": lambda: (a, moved(a, [0, 0, 0], rotation=tiny_turn)),
+        "near_parallel_slid": lambda: (a, moved(a, [0.3, 0, 0], scale=1.03, rotation=tiny_turn)),
         "small_tilt": lambda: (a, detection(rng, a, rng.uniform(0.06, 3.6))),
         "needle": lambda: ((a[0], needle, a[2]), (a[0] + 1e-3, needle, turn(rng, 0.01) @ a[2])),
         "zero_size": lambda: (a, (a[0], a[1] * [1, 0, 1], a[2])),
+        "zero_line": lambda: (a, (a[0], a[1] * [0, 1, 0], a[2])),
+        "zero_both": lambda: ((a[0], a[1] * [1, 1, 0], a[2]), (a[0], a[1] * [1, 1, 0], a[2])),
         "mirrored": lambda: (a, moved(a, near, rotation=turn(rng, 30) @ np.diag([1.0, 1.0, -1.0]))),
     }
     return pairs[kind]()
@@ -177,7 +180,8 @@ KINDS = (
         "coplanar",
     ),
     *("touch_face", "touch_edge", "touch_corner", "tiny_1cm", "tiny_1cm_near", "thin_plate", "large_offset"),
-    *("perm_90", "near_parallel", "small_tilt", "needle", "zero_size", "mirrored"),
+    *("perm_90", "near_parallel", "near_parallel_slid", "small_tilt", "needle"),
+    *("zero_size", "zero_line", "zero_both", "mirrored"),
 )
 
 
@@ -190,19 +194,40 @@ def stack(boxes: list[Box], dtype: torch.dtype = torch.float64) -> OrientedBoxes
     return OrientedBoxes(*(torch.from_numpy(np.stack(part)).to(dtype) for part in zip(*boxes, strict=True)))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_iou_is_exact(kind):
-    pairs = make_pairs(kind)
+def check_exact(pairs: list[tuple[Box, Box]]) -> None:
     first, second = (stack(list(side)) for side in zip(*pairs, strict=True))
     expected = torch.tensor([exact_iou(a, b) for a, b in pairs], dtype=torch.float64)
-
     iou, shared = box_iou(first, second)
     swapped, _ = box_iou(second, first)
-
     torch.testing.assert_close(iou.diagonal(), expected, rtol=0, atol=1e-12)
     torch.testing.assert_close(swapped.diagonal(), expected, rtol=0, atol=1e-12)
-    assert iou.isfinite().all()
-    assert ((iou >= 0) & (iou <= 1) & (shared >= 0)).all()
+    for values in (iou, swapped):
+        assert values.isfinite().all()
+        assert ((values >= 0) & (values <= 1)).all()
+    assert (shared >= 0).all()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_iou_is_exact(kind):
+    check_exact(make_pairs(kind))
+
+
+@pytest.mark.parametrize("exponent", range(-14, -3))
+@pytest.mark.parametrize("slid", [0.0, 0.3, 1.0])
+def test_nearly_parallel_faces(exponent, slid):
+    """Turned by 1e-14 to 1e-4 rad: in place, along a common plane, and face to face."""
+    rng = np.random.default_rng(100 + exponent)
+    a = anywhere(rng)
+    b = moved(a, [slid, 0, 0], rotation=turn(rng, np.degrees(10.0**exponent)))
+    check_exact([(a, b), (moved(a, 1e3 / a[1]), moved(b, 1e3 / b[1]))])
+
+
+@pytest.mark.parametrize("degrees", [0.06, 0.25, 1.0, 2.0, 3.6])
+def test_small_tilts_of_boxes_of_almost_one_size(degrees):
+    """Where clipping with a tolerance on coplanar faces errs most."""
+    rng = np.random.default_rng(int(100 * degrees))
+    boxes = [anywhere(rng) for _ in range(4)]
+    check_exact([(a, moved(a, [0.01, 0, 0], scale=1.03, rotation=turn(rng, degrees))) for a in boxes])
 
 
 def test_oracle_knows_closed_forms():
@@ -224,6 +249,29 @@ def test_gradients_are_finite(kind):
     assert all(t.grad is not None and t.grad.isfinite().all() for t in tensors)
 
 
+@pytest.mark.parametrize(
+    "kind", ["generic", "detection", "contained", "tiny_1cm_near", "large_offset", "small_tilt", "mirrored"]
+)
+def test_gradients_match_differences(kind):
+    """Along random directions; in the other kinds the IoU has a kink at the pair itself."""
+    rng = np.random.default_rng(3)
+    for a, b in make_pairs(kind):
+        offset = b[0] - a[0]  # near the origin, where a difference of centres is exact enough
+        values = [torch.from_numpy(v.copy()) for v in (np.zeros(3), a[1], a[2], offset, b[1], b[2])]
+        scale = float(min(*a[1], *b[1]))
+        steps = [scale * torch.from_numpy(rng.normal(size=v.shape)) for v in values]
+        steps[2], steps[5] = steps[2] / scale, steps[5] / scale
+
+        def iou(share, values=values, steps=steps):
+            at = [value + share * step for value, step in zip(values, steps, strict=True)]
+            boxes = [OrientedBoxes(*(v[None] for v in at[k : k + 3])) for k in (0, 3)]
+            return box_iou(*boxes)[0].sum()
+
+        slope = torch.autograd.functional.jacobian(iou, torch.zeros((), dtype=torch.float64))
+        difference = (iou(torch.tensor(1e-6)) - iou(torch.tensor(-1e-6))) / 2e-6
+        torch.testing.assert_close(slope, difference.double(), rtol=1e-5, atol=1e-7)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_single_precision_fallback(kind):
     near_origin = [
@@ -232,6 +280,6 @@ def test_single_precision_fallback(kind):
     sides = [stack(list(side), torch.float32) for side in zip(*near_origin, strict=True)]
     single, _ = _box_iou(*sides, torch.float32)
     double, _ = box_iou(*sides)
-    tolerance = 1e-4 if kind in ("thin_plate", "needle", "near_parallel") else 2e-6
+    tolerance = 1e-4 if kind in ("thin_plate", "needle", "near_parallel", "near_parallel_slid") else 2e-6
     assert single.dtype == torch.float32
     assert (single - double).diagonal().abs().max() <= tolerance

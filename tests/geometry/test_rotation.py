@@ -11,6 +11,7 @@ from raytran.errors import ShapeError
 from raytran.geometry.rotation import (
     geodesic_angle,
     matrix_from_quaternion,
+    quaternion_from_matrix,
     rotation_from_yaw,
     symmetric_yaw_error,
     upright_basis,
@@ -88,6 +89,22 @@ def test_symmetric_yaw_error_carries_the_gradient_of_the_prediction():
     predicted = torch.tensor([3.0, 3.0, 3.0], requires_grad=True)
     symmetric_yaw_error(predicted, torch.zeros(3), torch.tensor([1, 2, SYMMETRY_INFINITE])).sum().backward()
     assert predicted.grad.tolist() == [1.0, 1.0, 0.0]
+
+
+def test_quaternion_of_the_closest_rotation():
+    rotations = Rotation.random(50, random_state=4)
+    wxyz = torch.from_numpy(rotations.as_quat()[:, [3, 0, 1, 2]].copy())
+    exact = quaternion_from_matrix(_tensor(rotations))
+    torch.testing.assert_close((exact * wxyz).sum(dim=-1).abs(), torch.ones(50).double())
+    shear = (
+        torch.eye(3).double() + 0.2 * torch.rand(3, 3, generator=torch.Generator().manual_seed(0)).double()
+    )
+    u, _, vt = torch.linalg.svd(_tensor(rotations) @ shear)
+    closest = matrix_from_quaternion(quaternion_from_matrix(_tensor(rotations) @ shear))
+    torch.testing.assert_close(closest, u @ vt)
+    with_nan = torch.stack([torch.eye(3), torch.full((3, 3), torch.nan)])
+    assert quaternion_from_matrix(with_nan).isnan().all(dim=-1).tolist() == [False, True]
+    assert quaternion_from_matrix(torch.zeros(0, 3, 3)).shape == (0, 4)
 
 
 def test_quaternions_of_any_length_and_sign():

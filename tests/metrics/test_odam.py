@@ -69,6 +69,22 @@ def slow_counts(scenes, threshold: float, lowest_score: float) -> tuple[int, int
     return matched, predicted, true
 
 
+def of_class(scenes, label: int):
+    return [tuple(side.select(side.label == label) for side in scene) for scene in scenes]
+
+
+def slow_average_precision(scenes, threshold: float) -> float:
+    """Area under the best precision at each recall or above, one recall step of 1 / n at a time."""
+    points = [
+        (matched / true, matched / predicted)
+        for level in {s for p, _ in scenes for s in p.score.tolist()}
+        for matched, predicted, true in [slow_counts(scenes, threshold, level)]
+    ]
+    true = slow_counts(scenes, threshold, -1.0)[2]
+    steps = [(k + 0.5) / true for k in range(true)]
+    return sum(max((p for r, p in points if r > step), default=0.0) for step in steps) / true
+
+
 def test_equals_slow_computation():
     rng = np.random.default_rng(0)
     scenes = [random_scene(rng) for _ in range(30)]
@@ -96,6 +112,10 @@ def test_equals_slow_computation():
         assert scores["best"]["score_threshold"] == best
         assert scores["best"]["f1"] == pytest.approx(2 * f1[best][0])
         assert (scores["best"]["n_matched"], scores["best"]["n_predicted"]) == f1[best][1:]
+        assert scores["average_precision"] == pytest.approx(slow_average_precision(scenes, float(key)))
+        by_class = [slow_average_precision(of_class(scenes, label), float(key)) for label in (0, 1)]
+        assert scores["mean_average_precision"] == pytest.approx(sum(by_class) / 2)
+        assert 0.1 < scores["average_precision"] < 0.9
 
 
 def test_threshold_is_exclusive():
@@ -141,6 +161,7 @@ def test_best_threshold_drops_false_alarms_and_ignores_nan_scores():
     assert scores["precision"] == pytest.approx(2 / 5)
     assert scores["best"]["score_threshold"] == pytest.approx(0.7)
     assert scores["best"]["precision"] == pytest.approx(2 / 3)
+    assert scores["average_precision"] == pytest.approx(1 / 2 + 2 / 3 / 2)
 
 
 def test_scenes_without_predictions_or_objects():
@@ -149,6 +170,7 @@ def test_scenes_without_predictions_or_objects():
     metric.update([none, target, none], [target, none, none], ["a", "b", "c"])
     scores = metric.compute()["per_threshold"]["0.25"]
     assert (scores["n_true"], scores["n_predicted"], scores["n_matched"], scores["f1"]) == (1, 1, 0, 0.0)
+    assert scores["average_precision"] == scores["mean_average_precision"] == 0.0
     assert metric.rows("scene") == [
         {"scene_id": scene, "n_predicted": p, "n_true": t, "n_matched_0.25": 0, "n_matched_0.5": 0}
         for scene, p, t in (("a", 0, 1), ("b", 1, 0), ("c", 0, 0))

@@ -39,6 +39,7 @@ def test_threshold_counts_and_best_looks_below_it() -> None:
     assert (at_half["n_predicted"], at_half["n_matched"]) == (1, 1)
     assert at_half["best"]["f1"] == pytest.approx(1.0)
     assert at_half["best"]["score_threshold"] == pytest.approx(0.4)
+    assert at_half["average_precision"] == pytest.approx(1.0)
     assert "box_f1_sweep" not in results
 
 

@@ -14,22 +14,10 @@ import torch
 from torch import Tensor
 
 from raytran.errors import DataError
-from raytran.geometry.rotation import matrix_from_quaternion
-from raytran.types import CLASSES, SYMMETRY_INFINITE, ObjectSet
+from raytran.geometry.rotation import matrix_from_quaternion, quaternion_from_matrix
+from raytran.types import CLASS_BY_CATID, CLASSES, SYMMETRY_INFINITE, CadAlignments, ObjectSet
 
 _log = logging.getLogger(__name__)
-
-CLASS_BY_CATID: dict[str, str] = {
-    "02808440": "bathtub",
-    "02871439": "bookshelf",
-    "02933112": "cabinet",
-    "03001627": "chair",
-    "03211117": "display",
-    "04256520": "sofa",
-    "04379243": "table",
-    "02747177": "trashbin",
-}
-"""Class of each ShapeNet category (Scan2CAD EvaluateBenchmark.py); every other category is ``other``."""
 
 _SYMMETRY = {
     "__SYM_NONE": 1,
@@ -56,6 +44,7 @@ class SceneAnnotation:
         box_center: ``(M, 3)`` float64, centre of the model's box in CAD coordinates.
         box_half_size: ``(M, 3)`` float64, half extents of that box.
         symmetry: ``(M,)`` int64, 1, 2, 4 or ``SYMMETRY_INFINITE``.
+        scale: ``(M, 3)`` float64, S as annotated, of either sign.
     """
 
     scene_id: str
@@ -64,6 +53,7 @@ class SceneAnnotation:
     box_center: Tensor
     box_half_size: Tensor
     symmetry: Tensor
+    scale: Tensor
 
 
 def read_annotations(path: Path) -> dict[str, SceneAnnotation]:
@@ -87,7 +77,10 @@ def read_annotations(path: Path) -> dict[str, SceneAnnotation]:
     scenes: dict[str, SceneAnnotation] = {}
     try:
         for entry in entries:
-            scenes[str(entry["id_scan"])] = _scene(entry)
+            scene = _scene(entry)
+            if scene.scene_id in scenes:
+                raise ValueError(f"scene {scene.scene_id} occurs twice")
+            scenes[scene.scene_id] = scene
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise DataError(
             f"entry {len(scenes)} of {path} is not as in Scan2CAD's full_annotations.json "
@@ -126,6 +119,33 @@ def scene_objects(annotation: SceneAnnotation) -> ObjectSet:
     ).select(keep)
 
 
+def scene_alignments(annotation: SceneAnnotation) -> CadAlignments:
+    """Return all of a scene's models as annotated: what the published evaluation scripts compare with.
+
+    ``scale`` are the lengths of the columns of inv(M_scan) · T R S, and ``quaternion`` is the turn closest to
+    the columns at length one. A model without volume has no quaternion: NaN.
+
+    Args:
+        annotation: one scene of ``read_annotations``.
+    """
+    pose = annotation.scan_from_cad
+    scale = pose[:, :3, :3].norm(dim=1)
+    parts = [name.split("/", 1) for name in annotation.model_id]
+    return CadAlignments(
+        catid=tuple(catid for catid, _ in parts),
+        id_cad=tuple(name for _, name in parts),
+        translation=pose[:, :3, 3],
+        quaternion=quaternion_from_matrix(pose[:, :3, :3] / scale[:, None]),
+        scale=scale,
+        score=torch.ones(len(pose), dtype=torch.float64),
+        half_extent=annotation.box_half_size,
+        center=annotation.box_center,
+        symmetry=annotation.symmetry,
+        pose=pose,
+        annotated_scale=annotation.scale,
+    )
+
+
 def _scene(entry: dict[str, Any]) -> SceneAnnotation:
     models = entry["aligned_models"]
     return SceneAnnotation(
@@ -136,13 +156,17 @@ def _scene(entry: dict[str, Any]) -> SceneAnnotation:
         box_center=_vectors([model["center"] for model in models], 3),
         box_half_size=_vectors([model["bbox"] for model in models], 3),
         symmetry=torch.tensor([_SYMMETRY[model["sym"]] for model in models], dtype=torch.int64),
+        scale=_vectors([model["trs"]["scale"] for model in models], 3),
     )
 
 
 def _matrices(trs: Sequence[dict[str, Sequence[float]]]) -> Tensor:
     """Return T · R · S of each, ``(M, 4, 4)`` float64; quaternions are [w, x, y, z]."""
     matrices = torch.eye(4, dtype=torch.float64).repeat(len(trs), 1, 1)
-    rotation = matrix_from_quaternion(_vectors([part["rotation"] for part in trs], 4))
+    quaternion = _vectors([part["rotation"] for part in trs], 4)
+    if (quaternion == 0).all(dim=1).any():
+        raise ValueError("a quaternion has length zero")
+    rotation = matrix_from_quaternion(quaternion)
     matrices[:, :3, :3] = rotation * _vectors([part["scale"] for part in trs], 3)[:, None]
     matrices[:, :3, 3] = _vectors([part["translation"] for part in trs], 3)
     return matrices

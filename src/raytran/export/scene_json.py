@@ -93,7 +93,7 @@ def _objects(entries: Sequence[dict[str, Any]]) -> ObjectSet:
     def column(key: str, *shape: int) -> torch.Tensor:
         return torch.tensor([entry[key] for entry in entries], dtype=torch.float32).reshape(count, *shape)
 
-    models = tuple("/".join((e["catid_cad"], e["id_cad"])) if "id_cad" in e else "" for e in entries)
+    models = tuple("/".join((e["catid_cad"], e["id_cad"])) if e.get("id_cad") else "" for e in entries)
     return ObjectSet(
         label=torch.tensor([CLASSES.index(entry["category"]) for entry in entries], dtype=torch.int64),
         center=column("center", 3),

@@ -97,6 +97,32 @@ def matrix_from_quaternion(quaternion: Tensor) -> Tensor:
     return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
 
+def quaternion_from_matrix(matrix: Tensor) -> Tensor:
+    """Return the quaternions of the rotations closest in least squares to ``matrix``.
+
+    They are the eigenvectors of the largest eigenvalue of Davenport's symmetric matrix (Bar-Itzhack, 2000).
+
+    Args:
+        matrix: ``(..., 3, 3)``, rotations up to errors; one that is not finite gives NaN.
+
+    Returns:
+        ``(..., 4)`` unit quaternions [w, x, y, z] of either sign.
+    """
+    check_shape(matrix, "... 3 3", "matrix")
+    finite = matrix.isfinite().all(dim=-1).all(dim=-1)
+    m = torch.where(finite[..., None, None], matrix, 0.0)
+    trace = m.diagonal(dim1=-2, dim2=-1).sum(-1)
+    twist = torch.stack(
+        [m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], dim=-1
+    )
+    eye = torch.eye(3, dtype=m.dtype, device=m.device)
+    block = m + m.mT - trace[..., None, None] * eye
+    top = torch.cat([trace[..., None], twist], dim=-1)[..., None, :]
+    davenport = torch.cat([top, torch.cat([twist[..., None], block], dim=-1)], dim=-2)
+    quaternion = torch.linalg.eigh(davenport).eigenvectors[..., -1]
+    return torch.where(finite[..., None], quaternion, torch.nan)
+
+
 def geodesic_angle(a: Tensor, b: Tensor) -> Tensor:
     """Return the angle of the turn from ``a`` to ``b``.
 

@@ -3,83 +3,69 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
-from torchmetrics import Metric
 
 from raytran.errors import ShapeError
+from raytran.metrics.records import RecordMetric, SceneRecord
 
 
-class _PooledIoU(Metric):
+class _PooledIoU(RecordMetric):
     """Sum of the intersections over sum of the unions, so that large scenes weigh more than small ones."""
 
-    is_differentiable = False
-    higher_is_better = True
-    full_state_update = False
-
-    intersection: Tensor
-    union: Tensor
+    # One row for a scene: cells in the intersection, cells in the union.
+    truth_columns = 2
+    prediction_columns = 0
 
     def __init__(self, *, threshold: float = 0.5, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.threshold = threshold
-        self.add_state("intersection", default=torch.tensor(0), dist_reduce_fx="sum")
-        self.add_state("union", default=torch.tensor(0), dist_reduce_fx="sum")
 
-    def _add(self, probability: Tensor, target: Tensor) -> None:
-        if probability.shape != target.shape:
+    def update(self, probability: Tensor, target: Tensor, scene_ids: Sequence[str]) -> None:
+        """Count the cells of scenes.
+
+        Args:
+            probability: ``(B, ...)`` in [0, 1].
+            target: ``(B, ...)`` bool.
+            scene_ids: the name of each of the B scenes.
+
+        Raises:
+            ShapeError: the shapes differ, or there are not as many names as scenes.
+        """
+        if probability.shape != target.shape or len(scene_ids) != len(target):
             raise ShapeError(
-                f"expected probability and target of one shape, got {tuple(probability.shape)} "
-                f"and {tuple(target.shape)}"
+                "expected probability and target of one shape with a name for each scene, got "
+                f"{tuple(probability.shape)}, {tuple(target.shape)} and {len(scene_ids)} names"
             )
         predicted, true = probability > self.threshold, target.bool()
-        self.intersection += (predicted & true).sum()
-        self.union += (predicted | true).sum()
+        both, either = ((predicted & true).flatten(1).sum(dim=1), (predicted | true).flatten(1).sum(dim=1))
+        for name, *counts in zip(scene_ids, both.tolist(), either.tolist(), strict=True):
+            table = torch.tensor([counts], dtype=torch.float64)
+            self.keep(SceneRecord(name, table, table.new_zeros(0, self.prediction_columns)))
 
     def compute(self) -> Tensor:
-        """Return the IoU, a scalar; 0 if nothing is predicted and nothing is true."""
-        return self.intersection / self.union.clamp(min=1)
+        """Return the IoU, a float64 scalar; 0 if nothing is predicted and nothing is true."""
+        none = torch.zeros(1, self.truth_columns, dtype=torch.float64)
+        both, either = torch.cat([none, *(scene.truths for scene in self.scenes())]).sum(dim=0)
+        return both / either.clamp(min=1)
 
 
 class SceneOccupancyIoU(_PooledIoU):
-    """IoU of the occupied voxels, pooled over all scenes.
+    """IoU of the occupied voxels, ``(B, X, Y, Z)``, pooled over all scenes.
 
     Args:
         threshold: probability above which a voxel counts as occupied.
         **kwargs: see ``torchmetrics.Metric``.
     """
 
-    def update(self, probability: Tensor, target: Tensor) -> None:
-        """Count the voxels of scenes.
-
-        Args:
-            probability: ``(..., X, Y, Z)`` in [0, 1].
-            target: ``(..., X, Y, Z)`` bool.
-
-        Raises:
-            ShapeError: the shapes differ.
-        """
-        self._add(probability, target)
-
 
 class ForegroundIoU(_PooledIoU):
-    """IoU of the foreground pixels, pooled over all frames of all scenes.
+    """IoU of the foreground pixels, ``(B, N, H, W)``, pooled over all frames of all scenes.
 
     Args:
         threshold: probability above which a pixel counts as foreground.
         **kwargs: see ``torchmetrics.Metric``.
     """
-
-    def update(self, probability: Tensor, target: Tensor) -> None:
-        """Count the pixels of frames.
-
-        Args:
-            probability: ``(..., H, W)`` in [0, 1].
-            target: ``(..., H, W)`` bool.
-
-        Raises:
-            ShapeError: the shapes differ.
-        """
-        self._add(probability, target)

@@ -22,7 +22,7 @@ from raytran.run.checkpoint import load_model
 from raytran.run.curriculum import run_curriculum
 from raytran.run.demo_page import SPLITS, ShownScene, headline, write_page
 from raytran.run.entry import compose
-from raytran.run.evaluate import evaluate_model
+from raytran.run.evaluate import TASKS_WITH_SHAPE, evaluate_model
 from raytran.run.predict import predict_scene, write_scene
 from raytran.run.steps import StepTimes
 from raytran.run.train import FitResult
@@ -84,6 +84,7 @@ def _data(overrides: Sequence[str], output: Path) -> SceneDataModule:
         ConfigError: ``output`` holds a demo with other settings.
     """
     settings = ["experiment=stage2", "data.val_views=${views.predict_views}", f"output_dir={_quoted(output)}"]
+    settings.append("stage.targets=[occupancy,foreground,objects,shapes]")
     cfg = compose("train", [*overrides, *settings])
     wanted = {
         name: value if isinstance(value := cfg[name], str | int) else plain(value) for name in _RECORDED
@@ -116,6 +117,7 @@ def _evaluate(
     return evaluate_model(
         model,
         data.split(split),
+        tasks=TASKS_WITH_SHAPE,
         output=output / "evaluation" / split,
         score_threshold=cfg.score_threshold,
         duplicate_iou=cfg.duplicate_iou,

@@ -53,6 +53,9 @@ def headline(metrics: Mapping[str, Any]) -> dict[str, str]:
     for task, name in (("occupancy", "occupancy IoU"), ("foreground", "mask IoU")):
         if f"{task}_iou" in metrics:
             numbers[name] = f"{metrics[f'{task}_iou']:.2f}"
+    if "shape" in metrics:
+        iou = metrics["shape"]["iou"]
+        numbers["shape IoU"] = "–" if iou is None else f"{iou:.2f}"
     return numbers
 
 

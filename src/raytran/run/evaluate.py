@@ -6,7 +6,7 @@ from __future__ import annotations
 import csv
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,8 @@ from rich.progress import track
 from rich.table import Table
 from torch.utils.data import Dataset
 
+from raytran.errors import ConfigError
+from raytran.metrics.curves import accuracy_by_scene_size
 from raytran.metrics.records import Row
 from raytran.model import RayTran
 from raytran.run.build import build_data
@@ -25,6 +27,7 @@ from raytran.run.checkpoint import load_model, prediction_settings
 from raytran.run.device import choose_device
 from raytran.run.entry import compose
 from raytran.run.output import check_replaceable, replaced_folder
+from raytran.run.score import score
 from raytran.training.scores import DUPLICATE_IOU, SCORE_THRESHOLD, SceneScores
 from raytran.types import SceneBatch
 
@@ -32,6 +35,7 @@ _log = logging.getLogger(__name__)
 
 MARKER = "metrics.json"
 TASKS = ("objects", "occupancy", "foreground")
+TASKS_WITH_SHAPE = (*TASKS, "shape")
 
 
 def evaluate(cfg: DictConfig) -> dict[str, Any]:
@@ -45,6 +49,10 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
         DataError: the data are missing or damaged.
         ConfigError: ``output`` holds something that is no earlier result.
     """
+    if (cfg.checkpoint is None) == (cfg.predictions is None):
+        raise ConfigError("give either checkpoint=CKPT or predictions=DIR annotations=FILE, not both")
+    if cfg.predictions is not None:
+        return score(cfg)
     output = Path(cfg.output)
     check_replaceable(output.resolve(), marker=MARKER)
     settings = prediction_settings(cfg.checkpoint)
@@ -52,15 +60,21 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     overrides = list(HydraConfig.get().overrides.task)
     if not any(item.startswith("preset=") for item in overrides):
         cfg = compose("evaluate", [*overrides, f"preset={settings.preset}"])
+    cfg.split = cfg.split or "val"
     # The checkpoint, not the preset, says which images and which grid its model was made for.
     cfg.views.image_size = list(settings.image_size)
     cfg.views.num_views = cfg.num_views or settings.num_views
+    # The stages before it leave the shape head untrained.
+    tasks = TASKS_WITH_SHAPE if settings.stage == "shape" else TASKS
+    if "shape" in tasks:
+        cfg.stage.targets = [*cfg.stage.targets, "shapes"]
     cfg.model.grid_resolution, cfg.model.grid_extent = list(model.grid_resolution), list(model.grid_extent)
     data = build_data(cfg)
     data.prepare_data()
     metrics = evaluate_model(
         model,
         data.split(cfg.split),
+        tasks=tasks,
         output=output,
         score_threshold=cfg.score_threshold,
         duplicate_iou=cfg.duplicate_iou,
@@ -75,6 +89,7 @@ def evaluate_model(
     model: RayTran,
     dataset: Dataset[SceneBatch],
     *,
+    tasks: Collection[str] = TASKS,
     output: Path | None = None,
     score_threshold: float = SCORE_THRESHOLD,
     duplicate_iou: float | None = DUPLICATE_IOU,
@@ -86,6 +101,8 @@ def evaluate_model(
     Args:
         model: the network, on any device; put in evaluation mode.
         dataset: scenes with targets, each a ``SceneBatch`` with B = 1.
+        tasks: what to compare: ``TASKS``, or with the shapes of the objects found ``TASKS_WITH_SHAPE``, for
+            which the scenes must have shapes.
         output: folder for ``metrics.json``, ``per_scene.csv`` and ``per_object.csv``, which appear together
             or not at all; None writes nothing.
         score_threshold: objects with a lower score do not count as predicted.
@@ -94,28 +111,49 @@ def evaluate_model(
         progress: show a progress bar.
 
     Returns:
-        per protocol (``strict``) what ``Scan2CADAccuracy`` and ``OrientedBoxF1`` return, ``occupancy_iou``,
-        ``foreground_iou`` and what ``about`` says.
+        per protocol (``strict``) what ``Scan2CADAccuracy`` and ``OrientedBoxF1`` return, with the accuracy
+        ``by_scene_size``, the ``curves`` and the error ``atlas``; ``occupancy_iou``, ``foreground_iou``,
+        under ``shape`` what ``MatchedShapeScores`` returns, and what ``about`` says.
     """
     device = next(model.parameters()).device
-    scores = SceneScores(tasks=TASKS, score_threshold=score_threshold, duplicate_iou=duplicate_iou).to(device)
+    scores = SceneScores(
+        tasks=tasks,
+        score_threshold=score_threshold,
+        duplicate_iou=duplicate_iou,
+        volume_extent=model.grid_extent,
+    ).to(device)
     model.eval()
     for index in track(range(len(dataset)), "evaluating", disable=not progress, transient=True):  # type: ignore[arg-type]
-        batch = dataset[index].to(device)
-        with torch.no_grad():
-            raw = model(batch.views, tasks=TASKS, grid_center=batch.grid_center)
-            scores.update(batch, model.decode(raw, batch.scene_id, with_shapes=False))
-    found = scores.results()
-    metrics: dict[str, Any] = dict(about or {})
-    metrics |= {"score_threshold": score_threshold, "duplicate_iou": duplicate_iou}
-    metrics["strict"] = found["accuracy"] | {"per_threshold": found["box_f1"]["per_threshold"]}
-    metrics |= {f"{task}_iou": found[task] for task in ("occupancy", "foreground") if task in found}
+        _predict_and_compare(model, dataset[index].to(device), scores, score_threshold)
+    settings = {"score_threshold": score_threshold, "duplicate_iou": duplicate_iou}
+    metrics = {**(about or {}), **settings, **_by_protocol(scores)}
     if output is not None:
         with replaced_folder(output, marker=MARKER) as folder:
             (folder / MARKER).write_text(json.dumps(metrics, indent=2) + "\n")
             _write_csv(folder / "per_scene.csv", scores.rows("scene"))
             _write_csv(folder / "per_object.csv", scores.rows("object"))
     return metrics
+
+
+@torch.no_grad()
+def _predict_and_compare(
+    model: RayTran, batch: SceneBatch, scores: SceneScores, score_threshold: float
+) -> None:
+    raw = model(batch.views, tasks=TASKS, grid_center=batch.grid_center)
+    scores.update(batch, model.decode(raw, batch.scene_id, with_shapes=False))
+    if scores.shape is not None:
+        scores.update_shapes(batch, model.decode(raw, batch.scene_id, score_threshold=score_threshold))
+
+
+def _by_protocol(scores: SceneScores) -> dict[str, Any]:
+    """Return what all metrics say in the layout of ``metrics.json``."""
+    found = scores.results()
+    strict = found["accuracy"] | {"per_threshold": found["box_f1"]["per_threshold"]}
+    strict["by_scene_size"] = accuracy_by_scene_size(scores.rows("object"))
+    strict |= {"curves": found["curves"], "atlas": found["atlas"]}
+    metrics: dict[str, Any] = {"strict": strict}
+    metrics |= {f"{task}_iou": found[task] for task in ("occupancy", "foreground") if task in found}
+    return metrics | ({"shape": found["shape"]} if "shape" in found else {})
 
 
 def metrics_table(metrics: Mapping[str, Any], *, title: str) -> Table:
@@ -138,6 +176,11 @@ def metrics_table(metrics: Mapping[str, Any], *, title: str) -> Table:
     for task in ("occupancy", "foreground"):
         if f"{task}_iou" in metrics:
             table.add_row(f"IoU of {task}", "", "", f"{metrics[f'{task}_iou']:.3f}")
+    if metrics.get("shape", {}).get("n_matched"):
+        shape, iou = metrics["shape"], f"{metrics['shape']['iou']:.3f}"
+        table.add_row("IoU of found objects' shapes", str(shape["n_matched"]), "", iou)
+        if shape["chamfer_distance"] is not None:
+            table.add_row("chamfer distance of these", "", "", f"{100 * shape['chamfer_distance']:.1f} cm")
     return table
 
 

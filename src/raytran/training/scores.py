@@ -10,24 +10,32 @@ from typing import Any, Literal
 from torch import nn
 from torchmetrics import Metric
 
+from raytran.metrics.atlas import ErrorAtlas
+from raytran.metrics.curves import AccuracyCurves
 from raytran.metrics.odam import OrientedBoxF1
 from raytran.metrics.records import Row
 from raytran.metrics.scan2cad import Scan2CADAccuracy
 from raytran.metrics.scene import ForegroundIoU, SceneOccupancyIoU
+from raytran.metrics.shape import MatchedShapeScores
 from raytran.postprocess import select_objects
 from raytran.types import ObjectSet, SceneBatch, ScenePrediction
 
 SCORE_THRESHOLD = 0.5
 DUPLICATE_IOU = 0.25
 
+_OF_ALL_SCORES = ("best", "average_precision", "mean_average_precision")
+"""What only predictions of every score can tell."""
+
 
 class SceneScores(nn.Module):
-    """Alignment accuracy and box F1 of objects, IoU of occupancy and foreground, over all scenes seen.
+    """Alignment accuracy, box F1 and shapes of objects, IoU of occupancy and masks, over all scenes seen.
 
     Args:
-        tasks: what the model predicts: some of ``objects``, ``occupancy``, ``foreground``.
+        tasks: what the model predicts: some of ``objects``, ``occupancy``, ``foreground``, ``shape``.
         score_threshold: objects with a lower score do not count as predicted.
         duplicate_iou: nor does one that overlaps a surer one of its class by more than this IoU.
+        volume_extent: size of the voxel grid, metres; given, the results also tell why objects are missed
+            (``ErrorAtlas``) and how many would be found at other thresholds (``AccuracyCurves``).
     """
 
     def __init__(
@@ -36,6 +44,7 @@ class SceneScores(nn.Module):
         tasks: Collection[str],
         score_threshold: float = SCORE_THRESHOLD,
         duplicate_iou: float | None = DUPLICATE_IOU,
+        volume_extent: Sequence[float] | None = None,
     ) -> None:
         super().__init__()
         self._select = partial(select_objects, duplicate_iou=duplicate_iou)
@@ -44,6 +53,10 @@ class SceneScores(nn.Module):
         self.box_f1 = OrientedBoxF1(protocol="strict") if "objects" in tasks else None
         # Sees predictions of every score, to tell which threshold would have been the best.
         self.box_f1_sweep = OrientedBoxF1(protocol="strict") if "objects" in tasks else None
+        explain = "objects" in tasks and volume_extent is not None
+        self.curves = AccuracyCurves() if explain else None
+        self.atlas = ErrorAtlas(volume_extent=volume_extent) if explain else None
+        self.shape = MatchedShapeScores() if "shape" in tasks else None
         self.occupancy = SceneOccupancyIoU() if "occupancy" in tasks else None
         self.foreground = ForegroundIoU() if "foreground" in tasks else None
 
@@ -52,18 +65,19 @@ class SceneScores(nn.Module):
         if batch.objects is not None:
             self._update_objects(batch, batch.objects, predictions)
         for index, prediction in enumerate(predictions):
+            names = [batch.scene_id[index]]
             if (
                 self.occupancy is not None
                 and batch.occupancy is not None
                 and prediction.occupancy is not None
             ):
-                self.occupancy.update(prediction.occupancy, batch.occupancy[index])
+                self.occupancy.update(prediction.occupancy[None], batch.occupancy[index, None], names)
             if (
                 self.foreground is not None
                 and batch.foreground is not None
                 and prediction.foreground is not None
             ):
-                self.foreground.update(prediction.foreground, batch.foreground[index])
+                self.foreground.update(prediction.foreground[None], batch.foreground[index, None], names)
 
     def _update_objects(
         self, batch: SceneBatch, targets: Sequence[ObjectSet], predictions: Sequence[ScenePrediction]
@@ -73,15 +87,29 @@ class SceneScores(nn.Module):
         kept = [self._select(p, score_threshold=self._score_threshold).objects for p in predictions]
         self.accuracy.update(kept, targets, batch.scene_id)
         self.box_f1.update(kept, targets, batch.scene_id)
+        if self.curves is not None and self.atlas is not None:
+            self.curves.update(kept, targets, batch.scene_id)
+            self.atlas.update(kept, targets, batch.scene_id, list(batch.grid_center))
         every = [self._select(p, score_threshold=0.0).objects for p in predictions]
         self.box_f1_sweep.update(every, targets, batch.scene_id)
+
+    def update_shapes(self, batch: SceneBatch, predictions: Sequence[ScenePrediction]) -> None:
+        """Add the shapes of scenes; apart from ``update``, since decoding them for every slot is dear.
+
+        Args:
+            batch: scenes whose objects have shapes.
+            predictions: with shapes for at least the objects that count as predicted.
+        """
+        if self.shape is not None and batch.objects is not None:
+            kept = [self._select(p, score_threshold=self._score_threshold).objects for p in predictions]
+            self.shape.update(kept, batch.objects, batch.scene_id)
 
     def results(self) -> dict[str, Any]:
         """Return everything the metrics say, by metric, as plain Python; every rank must call it."""
         found = {name: _plain(metric.compute()) for name, metric in self._metrics().items()}
         sweep = found.pop("box_f1_sweep", {"per_threshold": {}})
         for threshold, scores in sweep["per_threshold"].items():
-            found["box_f1"]["per_threshold"][threshold]["best"] = scores["best"]
+            found["box_f1"]["per_threshold"][threshold] |= {name: scores[name] for name in _OF_ALL_SCORES}
         return found
 
     def compute(self) -> dict[str, float]:
@@ -99,11 +127,15 @@ class SceneScores(nn.Module):
         return numbers
 
     def rows(self, per: Literal["scene", "object"]) -> list[Row]:
-        """Return a row per scene or true object, the columns of both object metrics side by side."""
+        """Return a row per scene or true object, the columns of the object metrics side by side."""
         if self.accuracy is None or self.box_f1 is None:
             return []
-        pairs = zip(self.accuracy.rows(per), self.box_f1.rows(per), strict=True)
-        return [accuracy | box_f1 for accuracy, box_f1 in pairs]
+        tables = [
+            metric.rows(per)
+            for metric in (self.accuracy, self.box_f1, self.shape, self.atlas)
+            if metric is not None
+        ]
+        return [{k: v for row in rows for k, v in row.items()} for rows in zip(*tables, strict=True)]
 
     def reset(self) -> None:
         """Forget all scenes."""
@@ -118,4 +150,6 @@ def _plain(value: Any) -> Any:
     """Return ``value`` with tensors turned into numbers."""
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
     return value.item() if hasattr(value, "item") else value

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Precision, recall and F1 of detected objects, and the score threshold at which F1 is highest."""
+"""Precision, recall, F1 and average precision of detections, and the score threshold of the highest F1."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def best_f1(score: Tensor, matched: Tensor, n_true: int) -> BestScores:
 
     Args:
         score: ``(P,)`` of all predictions of all scenes.
-        matched: ``(P,)`` bool, whether a prediction took a true object.
+        matched: ``(P,)`` bool, whether a prediction took a true object, or how many it took.
         n_true: number of true objects.
 
     Returns:
@@ -55,11 +55,40 @@ def best_f1(score: Tensor, matched: Tensor, n_true: int) -> BestScores:
     """
     if score.numel() == 0:
         return BestScores(score_threshold=0.0, **detection_scores(0, 0, n_true))
+    level, n_matched, n_predicted = _running_counts(score, matched)
+    best = int((2 * n_matched.double() / (n_predicted + n_true)).argmax())  # the first of equals
+    chosen = detection_scores(int(n_matched[best]), int(n_predicted[best]), n_true)
+    return BestScores(score_threshold=float(level[best]), **chosen)
+
+
+def average_precision(score: Tensor, matched: Tensor, n_true: int) -> float:
+    """Return the area under the curve of precision against recall as the score threshold falls.
+
+    As in PASCAL VOC from 2010 on: precision is the highest at this recall or a greater one, and all points
+    of the curve count. Predictions of equal score enter together, so that their order does not matter.
+
+    Args:
+        score: ``(P,)`` of all predictions of all scenes.
+        matched: ``(P,)`` bool, whether a prediction took a true object, or how many it took; precision is
+            never counted above 1.
+        n_true: number of true objects.
+
+    Returns:
+        A value in [0, 1]; 0 without predictions or without true objects.
+    """
+    if score.numel() == 0 or n_true == 0:
+        return 0.0
+    _, n_matched, n_predicted = _running_counts(score, matched)
+    precision = (n_matched.double() / n_predicted).clamp(max=1)
+    envelope = precision.flip(0).cummax(dim=0).values.flip(0)
+    gained = n_matched.diff(prepend=n_matched.new_zeros(1))
+    return float((envelope * gained).sum() / n_true)
+
+
+def _running_counts(score: Tensor, matched: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return each score that occurs, highest first, and how many at or above it are matched and predicted."""
     values, order = score.sort(descending=True, stable=True)
     n_matched = matched[order].long().cumsum(dim=0)
     n_predicted = torch.arange(1, len(values) + 1, device=score.device)
-    f1 = 2 * n_matched / (n_predicted + n_true)
-    last_of_equals = torch.cat([values[1:] != values[:-1], torch.ones_like(matched[:1])])
-    best = int(torch.where(last_of_equals, f1, -1.0).argmax())
-    chosen = detection_scores(int(n_matched[best]), best + 1, n_true)
-    return BestScores(score_threshold=float(values[best]), **chosen)
+    last_of_equals = torch.cat([values[1:] != values[:-1], torch.ones_like(values[:1], dtype=torch.bool)])
+    return values[last_of_equals], n_matched[last_of_equals], n_predicted[last_of_equals]

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How good anybody's predictions are: files against annotations, without a model."""
+
+from __future__ import annotations
+
+import csv
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+from rich.console import Console
+
+from raytran.errors import ConfigError
+from raytran.metrics.records import Row
+from raytran.run.output import check_replaceable, replaced_folder
+from raytran.run.score_files import PredictionFiles, read_predictions
+from raytran.run.score_protocols import (
+    ProtocolScores,
+    Truth,
+    choose_protocols,
+    compare,
+    confidence,
+    read_truth,
+    score_protocol,
+)
+from raytran.run.score_table import atlas_table, comparison_table, scores_table
+
+_log = logging.getLogger(__name__)
+
+MARKER = "metrics.json"
+
+
+def score(cfg: DictConfig) -> dict[str, Any]:
+    """Run ``python -m raytran.evaluate predictions=DIR annotations=FILE``; see ``conf/evaluate.yaml``.
+
+    Returns:
+        The content of ``metrics.json``.
+
+    Raises:
+        ConfigError: a setting is missing or does not go with the predictions.
+        DataError: a file is missing or damaged.
+    """
+    if cfg.annotations is None:
+        raise ConfigError("predictions= needs annotations=FILE, Scan2CAD's full_annotations.json")
+    if cfg.num_resamples < 1:
+        raise ConfigError(f"num_resamples={cfg.num_resamples} is too few, give at least 1")
+
+    def path(name: str) -> Path | None:
+        return None if cfg[name] is None else Path(cfg[name])
+
+    metrics = score_predictions(
+        Path(cfg.predictions),
+        Path(cfg.annotations),
+        cfg.protocol,
+        compare_with=path("compare"),
+        split=path("split"),
+        scans=path("scans"),
+        volume_extent=list(cfg.volume_extent),
+        output=Path(cfg.output),
+        num_resamples=cfg.num_resamples,
+        seed=cfg.seed,
+    )
+    console = Console()
+    console.print(scores_table(metrics, title=str(cfg.predictions)))
+    if "strict" in metrics:
+        console.print(atlas_table(metrics["strict"]["atlas"]))
+    if "comparison" in metrics:
+        console.print(comparison_table(metrics["comparison"], str(cfg.predictions), str(cfg.compare)))
+    _log.info("wrote %s: %s", Path(cfg.output).resolve(), ", ".join(_written(metrics)))
+    return metrics
+
+
+def score_predictions(
+    predictions: Path,
+    annotations: Path,
+    protocol: str = "strict",
+    *,
+    compare_with: Path | None = None,
+    split: Path | None = None,
+    scans: Path | None = None,
+    volume_extent: Sequence[float] | None = None,
+    output: Path | None = None,
+    num_resamples: int = 2000,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """Score the predictions for many scenes.
+
+    Args:
+        predictions: folder or file, see ``read_predictions``.
+        annotations: Scan2CAD's ``full_annotations.json``.
+        protocol: ``strict``, ``scan2cad``, ``vid2cad``, ``odam``, or ``all`` of them that apply.
+        compare_with: other predictions for the same scenes.
+        split: text file of the scenes that were asked for; None: all annotated ones.
+        scans: ScanNet's ``scans`` folder, whose cameras tell where the voxel grid was.
+        volume_extent: size of that grid, metres.
+        output: folder for the results, which appear together or not at all, or None.
+        num_resamples: draws of the bootstrap.
+        seed: of the bootstrap.
+
+    Returns:
+        by protocol what its metric returns and ``confidence`` intervals; ``comparison`` by protocol.
+
+    Raises:
+        ConfigError: the protocol is unknown or does not fit the predictions, or ``output`` is in use.
+        DataError: a file is missing or damaged.
+    """
+    if output is not None:
+        check_replaceable(output.resolve(), marker=MARKER)
+    truth = read_truth(annotations, split=split, scans=scans)
+    files, scores = _by_protocol(protocol, predictions, truth, volume_extent)
+    metrics = {"predictions": str(predictions), "annotations": str(annotations), **files.counts()}
+    chance = {"num_resamples": num_resamples, "seed": seed}
+    for name, part in scores.items():
+        metrics[name] = part.metrics | {"confidence": confidence(part, **chance)}
+    if compare_with is not None:
+        others = _by_protocol(protocol, compare_with, truth)[1]
+        metrics["comparison"] = {
+            name: compare(part, others[name], **chance) for name, part in scores.items() if name in others
+        }
+    if output is not None:
+        _write(output, metrics, scores)
+    return metrics
+
+
+def _by_protocol(
+    protocol: str, path: Path, truth: Truth, volume_extent: Sequence[float] | None = None
+) -> tuple[PredictionFiles, dict[str, ProtocolScores]]:
+    files = read_predictions(path, truth.objects, truth.cad_boxes)
+    return files, {
+        name: score_protocol(name, files, truth, volume_extent=volume_extent)
+        for name in choose_protocols(protocol, files, path)
+    }
+
+
+def _write(output: Path, metrics: Mapping[str, Any], scores: Mapping[str, ProtocolScores]) -> None:
+    tables: dict[str, list[Row]] = {
+        "per_object.csv": [
+            {"protocol": name, **row} for name, part in scores.items() for row in part.objects
+        ],
+        "per_scene.csv": [{"protocol": name, **row} for name, part in scores.items() for row in part.scenes],
+    }
+    with replaced_folder(output, marker=MARKER) as folder:
+        (folder / MARKER).write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+        for name, rows in tables.items():
+            _write_csv(folder / name, rows)
+        if "strict" in scores:
+            misses = [row for row in scores["strict"].objects if row["cause"] != "found"]
+            content = {**metrics["strict"]["atlas"], "misses": misses}
+            (folder / "atlas.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+
+
+def _written(metrics: Mapping[str, Any]) -> list[str]:
+    return [MARKER, "per_object.csv", "per_scene.csv", *(["atlas.json"] if "strict" in metrics else [])]
+
+
+def _write_csv(path: Path, rows: Sequence[Row]) -> None:
+    """Write rows whose columns differ by protocol: a cell that a row lacks stays empty."""
+    columns = list(dict.fromkeys(column for row in rows for column in row)) or ["protocol", "scene_id"]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, fieldnames=columns, restval="")
+        writer.writeheader()
+        writer.writerows(rows)
