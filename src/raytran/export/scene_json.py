@@ -57,7 +57,7 @@ def write_scene_json(path: Path, prediction: ScenePrediction, mesh_names: Sequen
 
 
 def read_scene_json(path: Path) -> ScenePrediction:
-    """Read what ``write_scene_json`` wrote.
+    """Read what ``write_scene_json`` wrote; the numbers are float64, as written.
 
     Returns:
         The objects, with symmetry 1 and no shapes. The file does not hold the voxel grid, so ``grid_center``
@@ -91,7 +91,7 @@ def _objects(entries: Sequence[dict[str, Any]]) -> ObjectSet:
     count = len(entries)
 
     def column(key: str, *shape: int) -> torch.Tensor:
-        return torch.tensor([entry[key] for entry in entries], dtype=torch.float32).reshape(count, *shape)
+        return torch.tensor([entry[key] for entry in entries], dtype=torch.float64).reshape(count, *shape)
 
     models = tuple("/".join((e["catid_cad"], e["id_cad"])) if e.get("id_cad") else "" for e in entries)
     return ObjectSet(

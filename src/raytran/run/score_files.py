@@ -135,15 +135,8 @@ def _read(path: Path, scene_id: str, cad_boxes: CadBoxes) -> ScenePredictions:
         raise DataError(
             f"{path} says that it is scene {prediction.scene_id!r}, but its name says {scene_id!r}: rename it"
         )
-    objects = replace(
-        prediction.objects,
-        center=prediction.objects.center.double(),
-        size=prediction.objects.size.double(),
-        rotation=prediction.objects.rotation.double(),
-        score=prediction.objects.score.double(),
-    )
-    _check_objects(objects, path)
-    return _from_objects(path, objects, cad_boxes)
+    _check_objects(prediction.objects, path)
+    return _from_objects(path, prediction.objects, cad_boxes)
 
 
 def _check_objects(objects: ObjectSet, path: Path) -> None:
