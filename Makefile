@@ -21,9 +21,9 @@ $(VENV)/.installed: pyproject.toml requirements/ci.txt
 	$(BIN)/pip install --quiet --no-deps --editable .
 	@touch $@
 
-# Threads that spin while they wait for each other crawl as soon as anything else wants the cores.
+# OpenMP threads spin long while they wait for each other, which crawls as soon as anything else wants the cores.
 demo: install  ## Make rooms, train the three stages, evaluate, predict, and write one page to look at (CPU, minutes)
-	OMP_WAIT_POLICY=passive $(BIN)/python -m raytran.demo
+	GOMP_SPINCOUNT=10000 $(BIN)/python -m raytran.demo
 
 test: install  ## Run all tests
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal
