@@ -9,7 +9,7 @@ from typing import Any, TypedDict
 import torch
 from torch import Tensor
 
-from raytran.errors import ConfigError, ShapeError
+from raytran.errors import ConfigError
 from raytran.geometry.boxes import OrientedBoxes, box_iou
 from raytran.metrics.functional.box_f1 import (
     BestScores,
@@ -21,7 +21,7 @@ from raytran.metrics.functional.box_f1 import (
 from raytran.metrics.functional.cad_errors import cad_half_extents
 from raytran.metrics.functional.matching import match_in_order, score_order
 from raytran.metrics.functional.odam import bev_iou, odam_predicted_boxes, odam_true_boxes
-from raytran.metrics.records import Row, SceneRecord, SceneRecordMetric
+from raytran.metrics.records import ProtocolMetric, Row, SceneRecord
 from raytran.types import CLASSES, CadAlignments, ObjectSet
 
 BOX_F1_PROTOCOLS: tuple[str, ...] = ("strict", "odam")
@@ -47,7 +47,7 @@ class BoxF1Result(TypedDict):
     n_scenes: int
 
 
-class OrientedBoxF1(SceneRecordMetric):
+class OrientedBoxF1(ProtocolMetric):
     """Precision, recall and F1 of predicted boxes, pooled over all classes and scenes.
 
     Protocol ``strict``, which compares ``ObjectSet``s: exact IoU of the oriented boxes; all nine classes,
@@ -96,23 +96,8 @@ class OrientedBoxF1(SceneRecordMetric):
         # whether it is matched, or how often, at each threshold. An object with label -1 does not count.
         self.truth_columns = self.prediction_columns = 2 + len(self.iou_thresholds)
 
-    def judge(
-        self, predictions: ObjectSet | CadAlignments, targets: ObjectSet | CadAlignments
-    ) -> tuple[Tensor, Tensor]:
-        """Match one scene at each threshold; see the base class.
-
-        Raises:
-            ShapeError: the protocol compares objects of the other type.
-        """
-        strict = self.protocol == "strict"
-        if strict and isinstance(predictions, ObjectSet) and isinstance(targets, ObjectSet):
-            return self._judge_objects(predictions, targets)
-        if not strict and isinstance(predictions, CadAlignments) and isinstance(targets, CadAlignments):
-            return self._judge_cads(predictions, targets)
-        kind = "ObjectSet" if strict else "CadAlignments"
-        raise ShapeError(f"protocol {self.protocol} compares two {kind} for each scene")
-
-    def _judge_cads(self, predictions: CadAlignments, targets: CadAlignments) -> tuple[Tensor, Tensor]:
+    def judge_cads(self, predictions: CadAlignments, targets: CadAlignments) -> tuple[Tensor, Tensor]:
+        """Match by CAD alignments."""
         known = cad_half_extents([targets]) if self.cad_half_extents is None else self.cad_half_extents
         predicted_corners, predictions = odam_predicted_boxes(predictions, known)
         true_corners, counted = odam_true_boxes(targets)
@@ -131,7 +116,8 @@ class OrientedBoxF1(SceneRecordMetric):
         every[counted] = torch.stack(truths, dim=-1)
         return every, torch.stack(taken, dim=-1)
 
-    def _judge_objects(self, predictions: ObjectSet, targets: ObjectSet) -> tuple[Tensor, Tensor]:
+    def judge_objects(self, predictions: ObjectSet, targets: ObjectSet) -> tuple[Tensor, Tensor]:
+        """Match by boxes."""
         boxes_a = OrientedBoxes(predictions.center, predictions.size, predictions.rotation)
         boxes_b = OrientedBoxes(targets.center, targets.size, targets.rotation)
         iou, _ = box_iou(boxes_a, boxes_b)

@@ -188,3 +188,33 @@ class SceneRecordMetric(RecordMetric):
             rotation=boxes.rotation.detach().double(),
             score=boxes.score.detach().double(),
         )
+
+
+class ProtocolMetric(SceneRecordMetric):
+    """Base of the metrics that follow a protocol: ``strict`` on boxes, published scripts on alignments."""
+
+    protocol: str
+
+    def judge(
+        self, predictions: ObjectSet | CadAlignments, targets: ObjectSet | CadAlignments
+    ) -> tuple[Tensor, Tensor]:
+        """Match one scene by the protocol; see the base class.
+
+        Raises:
+            ShapeError: the protocol compares objects of the other type.
+        """
+        strict = self.protocol == "strict"
+        if strict and isinstance(predictions, ObjectSet) and isinstance(targets, ObjectSet):
+            return self.judge_objects(predictions, targets)
+        if not strict and isinstance(predictions, CadAlignments) and isinstance(targets, CadAlignments):
+            return self.judge_cads(predictions, targets)
+        kind = "ObjectSet" if strict else "CadAlignments"
+        raise ShapeError(f"protocol {self.protocol} compares two {kind} for each scene")
+
+    @abstractmethod
+    def judge_objects(self, predictions: ObjectSet, targets: ObjectSet) -> tuple[Tensor, Tensor]:
+        """Match one scene by protocol ``strict``."""
+
+    @abstractmethod
+    def judge_cads(self, predictions: CadAlignments, targets: CadAlignments) -> tuple[Tensor, Tensor]:
+        """Match one scene by the protocol of a published script."""

@@ -9,13 +9,13 @@ from typing import Any, NotRequired, TypedDict
 import torch
 from torch import Tensor
 
-from raytran.errors import ConfigError, ShapeError
+from raytran.errors import ConfigError
 from raytran.metrics.functional.alignment import AlignmentErrors, alignment_errors
 from raytran.metrics.functional.cad_errors import cad_symmetries, equal_names
 from raytran.metrics.functional.matching import match_in_order, score_order
 from raytran.metrics.functional.scan2cad import match_scan2cad
 from raytran.metrics.functional.vid2cad import VID2CAD_CLASS_BY_CATID, match_vid2cad
-from raytran.metrics.records import Row, SceneRecord, SceneRecordMetric
+from raytran.metrics.records import ProtocolMetric, Row, SceneRecord
 from raytran.types import CLASSES, CadAlignments, ObjectSet
 
 SCAN2CAD_PROTOCOLS: tuple[str, ...] = ("strict", "scan2cad", "vid2cad")
@@ -48,7 +48,7 @@ class Scan2CADResult(TypedDict):
     benchmark_global_average: NotRequired[float]
 
 
-class Scan2CADAccuracy(SceneRecordMetric):
+class Scan2CADAccuracy(ProtocolMetric):
     """Share of annotated objects that a prediction finds within 20 cm, 20 degrees and 20 % of size together.
 
     It is a recall: predictions too many cost nothing. Protocol ``strict``, which compares ``ObjectSet``s:
@@ -106,30 +106,16 @@ class Scan2CADAccuracy(SceneRecordMetric):
         self.cad_symmetries = None if cad_symmetries is None else dict(cad_symmetries)
         self.limits = (max_translation, max_rotation, max_scale)
 
-    def judge(
-        self, predictions: ObjectSet | CadAlignments, targets: ObjectSet | CadAlignments
-    ) -> tuple[Tensor, Tensor]:
-        """Match one scene; see the base class.
-
-        Raises:
-            ShapeError: the protocol compares objects of the other type.
-        """
-        strict = self.protocol == "strict"
-        if strict and isinstance(predictions, ObjectSet) and isinstance(targets, ObjectSet):
-            return self._judge_objects(predictions, targets)
-        if not strict and isinstance(predictions, CadAlignments) and isinstance(targets, CadAlignments):
-            return self._judge_cads(predictions, targets)
-        kind = "ObjectSet" if strict else "CadAlignments"
-        raise ShapeError(f"protocol {self.protocol} compares two {kind} for each scene")
-
-    def _judge_objects(self, predictions: ObjectSet, targets: ObjectSet) -> tuple[Tensor, Tensor]:
+    def judge_objects(self, predictions: ObjectSet, targets: ObjectSet) -> tuple[Tensor, Tensor]:
+        """Match by boxes."""
         errors = alignment_errors(predictions, targets)
         same_class = predictions.label[:, None] == targets.label
         match = match_in_order(score_order(predictions.score), same_class & errors.within(*self.limits))
         found = torch.stack([predictions.label.double(), predictions.score, (match >= 0).double()], dim=-1)
         return _truths(targets.label, errors, same_class, match, predictions.score), found
 
-    def _judge_cads(self, predictions: CadAlignments, targets: CadAlignments) -> tuple[Tensor, Tensor]:
+    def judge_cads(self, predictions: CadAlignments, targets: CadAlignments) -> tuple[Tensor, Tensor]:
+        """Match by CAD alignments."""
         if self.protocol == "vid2cad":
             errors, match = match_vid2cad(predictions, targets, self.limits)
         else:
