@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 LAYERS: list[set[str]] = [
+    {"parcel"},
     {"types", "errors"},
     {"geometry"},
     {"ops"},

@@ -2,13 +2,14 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import pytest
 import torch
 
 from raytran.backbone.backbone import Backbone
 from raytran.backbone.resnet import ResNet18
-from raytran.errors import ShapeError
+from raytran.errors import ConfigError, ShapeError
 from raytran.geometry.rotation import yaw_from_rotation
 from raytran.heads.foreground import ForegroundHead
 from raytran.heads.objects import ObjectHead
@@ -20,20 +21,31 @@ from raytran.model import TASKS, RayTran
 from raytran.types import ObjectSet, RawObjects, RawScene, SceneBatch, Views
 
 RESOLUTION, EXTENT, CHANNELS = (6, 6, 4), (6.0, 6.0, 3.0), 16
-WEIGHTS = dict.fromkeys(("occupancy", "foreground", "class", "center", "size", "yaw", "shape"), 1.0)
+WEIGHTS = dict.fromkeys(("occupancy", "foreground", "class", "center", "size", "yaw", "heat", "shape"), 1.0)
 
 
-def make_model(input_channels: int = 3) -> RayTran:
+def make_model(
+    input_channels: int = 3,
+    stride: int = 16,
+    widths: tuple[int, ...] = (8, 8, 4),
+    queries: Literal["learned", "proposal"] = "learned",
+) -> RayTran:
     torch.manual_seed(0)
     heads = {
         "occupancy": OccupancyHead(channels=CHANNELS),
-        "foreground": ForegroundHead(channels=CHANNELS, widths=(8, 8, 4)),
+        "foreground": ForegroundHead(channels=CHANNELS, widths=widths),
         "objects": ObjectHead(
-            channels=CHANNELS, num_heads=2, num_layers=2, num_queries=5, hidden=16, grid_extent=EXTENT
+            channels=CHANNELS,
+            num_heads=2,
+            num_layers=2,
+            num_queries=5,
+            queries=queries,
+            hidden=16,
+            grid_extent=EXTENT,
         ),
         "shape": ShapeHead(channels=CHANNELS, widths=(8, 8, 4, 4)),
     }
-    resnet = ResNet18(width=4, input_channels=input_channels)
+    resnet = ResNet18(width=4, stride=stride, input_channels=input_channels)
     backbone = Backbone(resnet=resnet, channels=CHANNELS, num_heads=2, num_blocks=2, expansion=1)
     return RayTran(backbone=backbone, heads=heads, grid_resolution=RESOLUTION, grid_extent=EXTENT)
 
@@ -202,3 +214,17 @@ def test_predict_runs_in_eval_mode_without_gradients() -> None:
     assert not prediction.objects.center.requires_grad
     torch.testing.assert_close(model.backbone.resnet.bn1.running_mean, statistics)
     assert prediction.foreground.shape == (2, 32, 48)
+
+
+def test_stride_8_and_proposed_queries() -> None:
+    model, views = make_model(stride=8, widths=(8, 4), queries="proposal"), make_views(scenes=2)
+    raw = model(views)
+    assert raw.foreground is not None
+    assert raw.foreground.shape == (2, 2, 32, 48)
+    assert raw.objects is not None
+    assert raw.objects[-1].center.shape == (2, 5, 3)
+    assert raw.proposals is not None
+    assert raw.proposals.class_logits.shape == (2, *RESOLUTION, 9)
+    assert len(model.predict(make_views(), with_shapes=False).objects) == 5
+    with pytest.raises(ConfigError, match="one width for each halving"):
+        make_model(stride=8)

@@ -13,7 +13,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from raytran.backbone.backbone import STRIDE, Backbone
+from raytran.backbone.backbone import Backbone
+from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.heads.slots import objects_of_slots
@@ -35,6 +36,9 @@ class RayTran(nn.Module):
         grid_resolution: ``(X, Y, Z)`` voxels.
         grid_extent: sizes of the voxel grid, metres.
         rays_per_cell: n×n rays join a cell of the feature map with the voxels they cross.
+
+    Raises:
+        ConfigError: the foreground head does not grow the features back to image size.
     """
 
     def __init__(
@@ -47,6 +51,11 @@ class RayTran(nn.Module):
         rays_per_cell: int = 2,
     ) -> None:
         super().__init__()
+        if "foreground" in heads and heads["foreground"].stride != backbone.stride:
+            raise ConfigError(
+                f"the foreground head grows features {heads['foreground'].stride}× and the encoder's stride "
+                f"is {backbone.stride}: give it one width for each halving but the last"
+            )
         self.backbone = backbone
         self.heads = nn.ModuleDict(heads)
         self.grid_resolution = (int(grid_resolution[0]), int(grid_resolution[1]), int(grid_resolution[2]))
@@ -67,20 +76,24 @@ class RayTran(nn.Module):
             Raw predictions, None for what was not asked for.
 
         Raises:
-            ShapeError: image sides are not divisible by 16, or tensors do not have the documented shapes.
+            ShapeError: image sides are not divisible by the encoder's stride, or tensors do not have the
+                documented shapes.
         """
         cameras = Cameras(views.intrinsics, views.world_from_camera, views.image_size)
         center = cameras.position.mean(dim=1) if grid_center is None else grid_center
         grid = VoxelGrid(self.grid_resolution, self.grid_extent, center)
-        feature_size = (views.image_size[0] // STRIDE, views.image_size[1] // STRIDE)
+        stride = self.backbone.stride
+        feature_size = (views.image_size[0] // stride, views.image_size[1] // stride)
         pairs = trace_pairs(cameras, grid, feature_size, self.rays_per_cell)
         with_pixels = "foreground" in tasks
         voxels, pixels = self.backbone(views.images, cameras, grid, pairs, with_pixels=with_pixels)
+        objects, proposals = self.heads["objects"](voxels, grid) if "objects" in tasks else (None, None)
         return RawScene(
             grid_center=center,
             occupancy=self.heads["occupancy"](voxels) if "occupancy" in tasks else None,
             foreground=self.heads["foreground"](pixels) if with_pixels else None,
-            objects=self.heads["objects"](voxels, grid) if "objects" in tasks else None,
+            objects=objects,
+            proposals=proposals,
         )
 
     def decode_shapes(self, embedding: Tensor) -> Tensor:

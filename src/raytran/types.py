@@ -18,12 +18,12 @@ ShapeNet's frame (+Y up, front -Z). ``CONVENTIONS.md`` says all of this at lengt
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+
+from raytran.parcel import Parcel
 
 CLASSES: tuple[str, ...] = (
     *("bathtub", "bookshelf", "cabinet", "chair", "display", "sofa", "table", "trashbin", "other"),
@@ -63,40 +63,6 @@ SHAPE_SIZE: int = 63
 
 SYMMETRY_INFINITE: int = 0
 """Value of ``ObjectSet.symmetry`` for a body of revolution; 1, 2 and 4 are the number of equal turns."""
-
-_Parcel = TypeVar("_Parcel", bound="Parcel")
-
-
-@dataclass(frozen=True)
-class Parcel:
-    """A frozen dataclass of tensors (or of parcels, or tuples of them) that moves between devices as one."""
-
-    def to(self: _Parcel, device: torch.device | str, *, non_blocking: bool = False) -> _Parcel:
-        """Return a copy with every tensor inside on ``device``."""
-        return self._map(lambda item: item.to(device, non_blocking=non_blocking))
-
-    def pin_memory(self: _Parcel) -> _Parcel:
-        """Return a copy with every tensor inside in page-locked memory (called by ``DataLoader``)."""
-        return self._map(lambda item: item.pin_memory())
-
-    def _map(self: _Parcel, change: Callable[[Any], Any]) -> _Parcel:
-        def visit(value: Any) -> Any:
-            if isinstance(value, Tensor | Parcel):
-                return change(value)
-            return tuple(visit(item) for item in value) if isinstance(value, tuple) else value
-
-        return replace(self, **{field.name: visit(getattr(self, field.name)) for field in fields(self)})
-
-    def _select(self: _Parcel, count: int, index: Tensor) -> _Parcel:
-        """Return rows of a parcel whose fields all have ``count`` rows, or none."""
-        chosen = torch.arange(count, device=index.device)[index].tolist()
-
-        def pick(value: Any) -> Any:
-            if isinstance(value, tuple):
-                return tuple(value[i] for i in chosen) if value else ()
-            return None if value is None else value[index]
-
-        return replace(self, **{field.name: pick(getattr(self, field.name)) for field in fields(self)})
 
 
 @dataclass(frozen=True)
@@ -262,6 +228,25 @@ class RawObjects(Parcel):
 
 
 @dataclass(frozen=True)
+class RawProposals(Parcel):
+    """What every voxel says about an object centred in it: where proposal queries come from.
+
+    Attributes:
+        anchor: ``(B, X, Y, Z, 3)`` centre of each voxel in the world, metres.
+        class_logits: ``(B, X, Y, Z, K)`` logits, one per class, of an object's centre lying in the voxel.
+        center: ``(B, X, Y, Z, 3)`` box centre in the world, metres.
+        log_size: ``(B, X, Y, Z, 3)`` natural logarithm of the sizes in metres.
+        yaw_vector: ``(B, X, Y, Z, 2)`` (sin, cos) of the yaw, not normalised.
+    """
+
+    anchor: Tensor
+    class_logits: Tensor
+    center: Tensor
+    log_size: Tensor
+    yaw_vector: Tensor
+
+
+@dataclass(frozen=True)
 class RawScene(Parcel):
     """What the network returns for the tasks it was asked to do; None for the others.
 
@@ -270,12 +255,14 @@ class RawScene(Parcel):
         occupancy: ``(B, X, Y, Z)`` logits.
         foreground: ``(B, N, H, W)`` logits.
         objects: one ``RawObjects`` per decoder layer, last layer last.
+        proposals: where the queries of ``objects`` come from; None if they are learned.
     """
 
     grid_center: Tensor
     occupancy: Tensor | None = None
     foreground: Tensor | None = None
     objects: tuple[RawObjects, ...] | None = None
+    proposals: RawProposals | None = None
 
 
 @dataclass(frozen=True)

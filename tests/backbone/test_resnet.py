@@ -34,6 +34,14 @@ def test_stride_is_16() -> None:
     assert ResNet18(width=8)(torch.randn(2, 3, 48, 64)).shape == (2, 64, 3, 4)
 
 
+def test_stride_8_keeps_the_same_parameters() -> None:
+    fine = ResNet18(width=8, stride=8)
+    assert fine(torch.randn(2, 3, 48, 64)).shape == (2, 64, 6, 8)
+    fine.load_state_dict(ResNet18(width=8).state_dict())
+    with pytest.raises(ConfigError, match="8 or 16"):
+        ResNet18(width=8, stride=4)
+
+
 @pytest.mark.parametrize("with_classifier", [True, False])
 def test_loads_a_file_in_torchvisions_naming(tmp_path: Path, with_classifier: bool) -> None:
     source = ResNet18().eval()

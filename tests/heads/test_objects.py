@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import pytest
 import torch
 
+from raytran.errors import ConfigError
 from raytran.geometry.grid import VoxelGrid
 from raytran.heads.objects import ObjectHead
+from raytran.types import RawObjects
 
 EXTENT = (4.0, 4.0, 2.0)
 
 
-def small_head(**changes: int) -> ObjectHead:
+def small_head(**changes: int | str) -> ObjectHead:
     torch.manual_seed(0)
     sizes = {
         "channels": 24,
@@ -27,9 +30,15 @@ def grid_at(*centers: list[float]) -> VoxelGrid:
     return VoxelGrid((4, 4, 2), EXTENT, torch.tensor(centers))
 
 
+def last(head: ObjectHead, voxels: torch.Tensor, grid: VoxelGrid) -> RawObjects:
+    """What the last layer predicts."""
+    return head(voxels, grid)[0][-1]
+
+
 def test_shapes_of_every_layer() -> None:
-    outputs = small_head()(torch.randn(2, 4, 4, 2, 24), grid_at([0.0, 0, 0], [1.0, 2, 3]))
+    outputs, proposals = small_head()(torch.randn(2, 4, 4, 2, 24), grid_at([0.0, 0, 0], [1.0, 2, 3]))
     assert len(outputs) == 2
+    assert proposals is None
     for objects in outputs:
         assert objects.class_logits.shape == (2, 6, 10)
         assert objects.center.shape == objects.log_size.shape == (2, 6, 3)
@@ -39,13 +48,13 @@ def test_shapes_of_every_layer() -> None:
 
 def test_centers_move_with_the_grid() -> None:
     head, voxels = small_head(), torch.randn(1, 4, 4, 2, 24)
-    here, there = head(voxels, grid_at([0.0, 0, 0]))[-1], head(voxels, grid_at([10.0, -20, 5]))[-1]
+    here, there = last(head, voxels, grid_at([0.0, 0, 0])), last(head, voxels, grid_at([10.0, -20, 5]))
     torch.testing.assert_close(there.center - here.center, torch.tensor([10.0, -20, 5]).expand(1, 6, 3))
     torch.testing.assert_close(there.log_size, here.log_size)
 
 
 def test_untrained_objects_lie_in_the_volume_with_common_sizes() -> None:
-    objects = small_head(num_queries=32)(torch.randn(1, 4, 4, 2, 24), grid_at([0.0, 0, 0]))[-1]
+    objects = last(small_head(num_queries=32), torch.randn(1, 4, 4, 2, 24), grid_at([0.0, 0, 0]))
     assert bool((objects.center.abs() < torch.tensor(EXTENT) / 2).all())
     # One slot in each octant at least: no object is far from every slot.
     octant = (objects.center[0] > 0).long() @ torch.tensor([4, 2, 1])
@@ -55,7 +64,7 @@ def test_untrained_objects_lie_in_the_volume_with_common_sizes() -> None:
 
 def test_every_parameter_gets_a_gradient() -> None:
     head = small_head()
-    outputs = head(torch.randn(1, 4, 4, 2, 24), grid_at([0.0, 0, 0]))
+    outputs, _ = head(torch.randn(1, 4, 4, 2, 24), grid_at([0.0, 0, 0]))
     fields = ("class_logits", "center", "log_size", "yaw_vector")
     sum(getattr(objects, name).square().sum() for objects in outputs for name in fields).backward()
     assert [name for name, p in head.named_parameters() if p.grad is None or not p.grad.any()] == []
@@ -64,8 +73,13 @@ def test_every_parameter_gets_a_gradient() -> None:
 def test_half_precision_keeps_centers_exact() -> None:
     """bfloat16 has steps of 16 mm at 4 m; centres must not be rounded to them."""
     head, voxels, grid = small_head(), torch.randn(1, 4, 4, 2, 24), grid_at([100.0, 0, 0])
-    exact = head(voxels, grid)[-1]
+    exact = last(head, voxels, grid)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        half = head(voxels, grid)[-1]
+        half = last(head, voxels, grid)
     assert half.center.dtype == half.class_logits.dtype == torch.float32
     assert float((half.center - exact.center).detach().abs().max()) < 0.02
+
+
+def test_unknown_queries() -> None:
+    with pytest.raises(ConfigError, match="learned or proposal"):
+        small_head(queries="random")

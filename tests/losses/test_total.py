@@ -18,6 +18,7 @@ WEIGHTS = {
     "center": 2.0,
     "size": 3.0,
     "yaw": 4.0,
+    "heat": 1.0,
     "shape": 5.0,
 }
 VIEWS = Views(torch.zeros(1, 1, 3, 4, 4), torch.eye(3)[None, None], torch.eye(4)[None, None])
@@ -103,7 +104,8 @@ def test_errors_say_what_is_missing(make_objects, make_perfect) -> None:
         total_loss()(raw, batch(), terms=("objects", "depth"))
 
 
-def test_a_small_decoder_overfits_two_scenes(make_objects) -> None:
+@pytest.mark.parametrize("queries", ["learned", "proposal"])
+def test_a_small_decoder_overfits_two_scenes(make_objects, queries) -> None:
     """From voxel features that tell the scenes apart; centres within 10 cm after 150 steps."""
     torch.manual_seed(0)
     head = ObjectHead(
@@ -111,6 +113,7 @@ def test_a_small_decoder_overfits_two_scenes(make_objects) -> None:
         num_heads=2,
         num_layers=2,
         num_queries=8,
+        queries=queries,
         hidden=48,
         windowed=True,
         grid_extent=(5.0, 5.0, 5.0),
@@ -122,7 +125,9 @@ def test_a_small_decoder_overfits_two_scenes(make_objects) -> None:
     optimizer = torch.optim.AdamW(head.parameters(), lr=3e-3)
     history = []
     for _ in range(150):
-        losses = loss(RawScene(grid.center, objects=head(voxels, grid)), targets, terms=("objects",))
+        objects, proposals = head(voxels, grid)
+        raw = RawScene(grid.center, objects=objects, proposals=proposals)
+        losses = loss(raw, targets, terms=("objects",))
         optimizer.zero_grad()
         losses["total"].backward()
         torch.nn.utils.clip_grad_norm_(head.parameters(), 1.0)

@@ -17,9 +17,6 @@ from raytran.geometry.position import position_code
 from raytran.ops.pairs import PairList
 from raytran.ops.splat import splat_features
 
-STRIDE = 16
-"""Image pixels along each side of a feature cell."""
-
 
 class Backbone(nn.Module):
     """ResNet-18 per view, features averaged into voxels, then ``num_blocks`` 2D⇔3D blocks.
@@ -70,6 +67,11 @@ class Backbone(nn.Module):
         self.register_buffer("image_mean", torch.tensor(shift[: resnet.input_channels]), persistent=False)
         self.register_buffer("image_std", torch.tensor(scale[: resnet.input_channels]), persistent=False)
 
+    @property
+    def stride(self) -> int:
+        """Image pixels along each side of a feature cell."""
+        return self.resnet.stride
+
     def forward(
         self, images: Tensor, cameras: Cameras, grid: VoxelGrid, pairs: PairList, *, with_pixels: bool = True
     ) -> tuple[Tensor, Tensor | None]:
@@ -79,19 +81,19 @@ class Backbone(nn.Module):
             images: ``(B, N, 3 or 4, H, W)`` uint8, or floating point in [0, 1].
             cameras: of leading shape ``(B, N)``.
             grid: the voxel grids, ``center`` ``(B, 3)``.
-            pairs: the pixel-voxel pairs of all B scenes, for feature maps of ``H/16 × W/16``.
+            pairs: the pixel-voxel pairs of all B scenes, for feature maps of ``H/stride × W/stride``.
             with_pixels: False leaves out the last block's 3D→2D stream, which only pixel features need.
 
         Returns:
             voxel features ``(B, X, Y, Z, C)``, and pixel features ``(B, N, h, w, C)`` or None.
 
         Raises:
-            ShapeError: images have other channels than the encoder, or sides not divisible by 16.
+            ShapeError: images have other channels than the encoder, or sides not divisible by the stride.
         """
         check_shape(images, f"B N {self.resnet.input_channels} H W", "images")
-        if images.shape[-2] % STRIDE or images.shape[-1] % STRIDE:
+        if images.shape[-2] % self.stride or images.shape[-1] % self.stride:
             raise ShapeError(
-                f"expected images with sides divisible by {STRIDE}, got {tuple(images.shape[-2:])}"
+                f"expected images with sides divisible by {self.stride}, got {tuple(images.shape[-2:])}"
             )
         pixels = self._embed(images.flatten(0, 1))
         pixels = pixels + self._locate_rays(cameras, grid, pixels.shape[1:3])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ResNet-18 at stride 16 with torchvision's parameter names (He et al., CVPR 2016)."""
+"""ResNet-18 at stride 16 or 8 with torchvision's parameter names (He et al., CVPR 2016)."""
 
 from __future__ import annotations
 
@@ -48,6 +48,8 @@ class ResNet18(nn.Module):
 
     Args:
         width: channels of the first stage; 64 is ResNet-18, the output has ``8 · width``.
+        stride: image pixels along each side of a feature cell, 16 (the paper) or 8, where the third stage
+            keeps its resolution too: small images then keep more cells.
         input_channels: 3, or 4 with a mask as input (RayTran §4). Weights for three channels are kept and
             the fourth starts at zero, so that the network begins as the pretrained one.
         weights: None (random), ``"imagenet"`` (fetched by URL, hash checked), ``"auto"`` (the same, but
@@ -55,14 +57,22 @@ class ResNet18(nn.Module):
             torchvision's names, with or without ``fc``. Needed only at construction.
 
     Raises:
-        ConfigError: weights are given for another width.
+        ConfigError: weights are given for another width, or the stride is neither 16 nor 8.
         CheckpointError: the weights cannot be fetched, read, or do not fit.
     """
 
     def __init__(
-        self, *, width: int = 64, input_channels: int = 3, weights: str | Path | None = None
+        self,
+        *,
+        width: int = 64,
+        stride: int = 16,
+        input_channels: int = 3,
+        weights: str | Path | None = None,
     ) -> None:
         super().__init__()
+        if stride not in (8, 16):
+            raise ConfigError(f"resnet stride must be 8 or 16, got {stride}")
+        self.stride = stride
         self.input_channels = input_channels
         self.out_channels = 8 * width
         self.conv1 = nn.Conv2d(input_channels, width, 7, stride=2, padding=3, bias=False)
@@ -70,7 +80,7 @@ class ResNet18(nn.Module):
         self.maxpool = nn.MaxPool2d(3, stride=2, padding=1)
         self.layer1 = _stage(width, width, stride=1)
         self.layer2 = _stage(width, 2 * width, stride=2)
-        self.layer3 = _stage(2 * width, 4 * width, stride=2)
+        self.layer3 = _stage(2 * width, 4 * width, stride=stride // 8)
         self.layer4 = _stage(4 * width, 8 * width, stride=1)
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
@@ -83,7 +93,7 @@ class ResNet18(nn.Module):
             self._load(weights)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Map normalised images ``(n, 3 or 4, H, W)`` to features ``(n, 8 · width, H/16, W/16)``."""
+        """Map normalised images ``(n, 3 or 4, H, W)`` to features ``(n, 8 · width, H/stride, W/stride)``."""
         x = self.maxpool(torch.relu_(self.bn1(self.conv1(images))))
         return self.layer4(self.layer3(self.layer2(self.layer1(x))))
 

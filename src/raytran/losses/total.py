@@ -14,10 +14,11 @@ from raytran.losses.foreground import foreground_loss
 from raytran.losses.matcher import HungarianMatcher, Match
 from raytran.losses.objects import object_losses
 from raytran.losses.occupancy import occupancy_loss
+from raytran.losses.proposals import proposal_losses
 from raytran.losses.shape import shape_loss
 from raytran.types import ObjectSet, RawObjects, RawScene, SceneBatch
 
-WEIGHTS = ("occupancy", "foreground", "class", "center", "size", "yaw", "shape")
+WEIGHTS = ("occupancy", "foreground", "class", "center", "size", "yaw", "heat", "shape")
 TERMS = ("occupancy", "foreground", "objects", "shape")
 
 _T = TypeVar("_T")
@@ -67,7 +68,8 @@ class TotalLoss(nn.Module):
 
         Returns:
             ``occupancy``, ``foreground``, ``shape``; ``objects/class``, ``objects/center``, ``objects/size``,
-            ``objects/yaw`` of the last decoder layer, ``objects/class/layer0`` and so on of earlier ones.
+            ``objects/yaw`` of the last decoder layer, ``objects/class/layer0`` and so on of earlier ones,
+            ``objects/heat/proposals`` and so on of the proposals, if the network makes any.
 
         Raises:
             ConfigError: a term is unknown, or the network was not asked for it.
@@ -111,6 +113,9 @@ class TotalLoss(nn.Module):
             )
             suffix = "" if is_last else f"/layer{index}"
             losses |= {f"objects/{name}{suffix}": value for name, value in found.items()}
+        if "objects" in terms and raw.proposals is not None:
+            found = proposal_losses(raw.proposals, targets, num_objects=num_objects)
+            losses |= {f"objects/{name}/proposals": value for name, value in found.items()}
         return losses
 
     def _weight(self, name: str) -> float:

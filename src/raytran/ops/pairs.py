@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from raytran.errors import ShapeError, check_shape
-from raytran.types import Parcel
+from raytran.parcel import Parcel
 
 Side = Literal["pixels", "voxels"]
 

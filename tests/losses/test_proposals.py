@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+
+from raytran.geometry.grid import VoxelGrid
+from raytran.geometry.rotation import rotation_from_yaw
+from raytran.losses.proposals import SPREAD, center_heat, proposal_losses
+from raytran.types import ObjectSet, RawProposals
+
+GRID = VoxelGrid((4, 4, 4), (2.0, 2.0, 2.0), torch.zeros(1, 3))
+
+
+def objects(*centers: list[float]) -> ObjectSet:
+    count = len(centers)
+    return ObjectSet(
+        label=torch.arange(count) % 9,
+        center=torch.tensor(centers).reshape(-1, 3),
+        size=torch.full((count, 3), 0.5),
+        rotation=rotation_from_yaw(torch.full((count,), 0.3)),
+        symmetry=torch.ones(count, dtype=torch.int64),
+        score=torch.ones(count),
+    )
+
+
+def perfect(found: ObjectSet) -> RawProposals:
+    """Proposals that say at every voxel what the nearest object is."""
+    anchor = GRID.voxel_centers()
+    nearest = (anchor[..., None, :] - found.center).norm(dim=-1).argmin(dim=-1)
+    logits = torch.full((*anchor.shape[:-1], 9), -30.0)
+    for heat, label in zip(center_heat(anchor[0], found), found.label.tolist(), strict=True):
+        logits[0, ..., label].view(-1)[heat == 1] = 30.0
+    yaw = torch.tensor([math.sin(0.3), math.cos(0.3)])
+    return RawProposals(
+        anchor, logits, found.center[nearest], found.size.log()[nearest], yaw.expand(*anchor.shape[:-1], 2)
+    )
+
+
+def test_heat_is_one_where_the_centre_lies_and_a_gaussian_around() -> None:
+    heat = center_heat(GRID.voxel_centers()[0], objects([0.3, 0.2, -0.1])).reshape(4, 4, 4)
+    assert float(heat[2, 2, 1]) == 1.0
+    # Voxel (3, 2, 1) is centred at (0.75, 0.25, -0.25), half a metre a voxel.
+    distance = torch.tensor([0.45, 0.05, -0.15]) / 0.5
+    expected = math.exp(-float(distance.square().sum()) / (2 * SPREAD**2))
+    assert float(heat[3, 2, 1]) == pytest.approx(expected, rel=1e-5)
+    assert float(center_heat(GRID.voxel_centers()[0], objects([1.2, 0.0, 0.0])).max()) == 0.0
+
+
+def test_perfect_proposals_cost_nothing_and_wrong_ones_their_error() -> None:
+    found = objects([0.3, 0.2, -0.1], [-0.6, -0.7, 0.4])
+    best = perfect(found)
+    losses = proposal_losses(best, [found], num_objects=torch.tensor(2.0))
+    assert all(float(value) < 1e-5 for value in losses.values())
+    moved = RawProposals(best.anchor, best.class_logits, best.center + 0.5, best.log_size, best.yaw_vector)
+    # Smooth L1 beyond 0.1 m: error minus half of that, over three axes, mean over objects.
+    shifted = proposal_losses(moved, [found], num_objects=torch.tensor(2.0))
+    assert float(shifted["center"]) == pytest.approx(3 * 0.45, rel=1e-5)
+
+
+def test_heat_loss_punishes_missed_centres_and_false_ones() -> None:
+    found = objects([0.3, 0.2, -0.1])
+    best = perfect(found)
+
+    def heat_loss(change: Callable[[torch.Tensor], None]) -> float:
+        logits = best.class_logits.clone()
+        change(logits)
+        raw = RawProposals(best.anchor, logits, best.center, best.log_size, best.yaw_vector)
+        return float(proposal_losses(raw, [found], num_objects=torch.tensor(1.0))["heat"])
+
+    assert heat_loss(lambda logits: logits[0, 2, 2, 1, 0].fill_(-5.0)) == pytest.approx(5.0, rel=0.02)
+    far = heat_loss(lambda logits: logits[0, 0, 0, 3, 0].fill_(5.0))
+    near = heat_loss(lambda logits: logits[0, 3, 2, 1, 0].fill_(5.0))
+    assert far == pytest.approx(5.0, rel=0.02)
+    assert near < 0.5 * far
+    assert heat_loss(lambda logits: logits[0, 2, 2, 1, 4].fill_(5.0)) == pytest.approx(5.0, rel=0.02)
+
+
+def test_a_scene_without_objects_still_reaches_every_output() -> None:
+    raw = perfect(objects([0.0, 0.0, 0.0]))
+    leaves = [value.clone().requires_grad_() for value in (raw.class_logits, raw.center)]
+    losses = proposal_losses(
+        RawProposals(raw.anchor, leaves[0], leaves[1], raw.log_size, raw.yaw_vector),
+        [objects()],
+        num_objects=torch.tensor(1.0),
+    )
+    sum(losses.values()).backward()
+    assert all(leaf.grad is not None for leaf in leaves)
