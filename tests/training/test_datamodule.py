@@ -3,6 +3,11 @@ from __future__ import annotations
 
 from collections import Counter
 
+import pytest
+
+from raytran.data.augment import Augmentation
+from raytran.run.build import build_data
+from raytran.run.entry import compose
 from raytran.training.datamodule import EpochSampler, SceneDataModule
 
 
@@ -47,6 +52,21 @@ def test_training_draws_views_and_validation_spreads_them(monkeypatch, tmp_path)
     training, validation = data.split("train", training=True).options, data.split("val").options
     assert (training["split"], training["view_choice"], training["num_views"]) == ("train", "random", 7)
     assert (validation["split"], validation["view_choice"], validation["num_views"]) == ("val", "even", 9)
+
+
+def test_only_training_scenes_are_augmented(monkeypatch, tmp_path):
+    data = make_data(monkeypatch, tmp_path, augmentation=Augmentation(mirror=1.0))
+    assert data.split("train", training=True).options["augmentation"].mirror == 1
+    assert data.split("train").options["augmentation"] is None
+    assert data.split("val").options["augmentation"] is None
+
+
+@pytest.mark.parametrize("data", ["rooms", "scan2cad"])
+def test_augmentation_is_off_unless_asked_for(data):
+    overrides = ["preset=raytran", f"data={data}", "data.root=unused", "output_dir=unused"]
+    assert build_data(compose("train", overrides))._augmentation == Augmentation()
+    asked = build_data(compose("train", [*overrides, "data.augmentation.shift=[0.5,0.5,0.2]"]))
+    assert asked._augmentation == Augmentation(shift=(0.5, 0.5, 0.2))
 
 
 def test_ranks_share_the_scenes():

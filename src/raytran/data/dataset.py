@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from raytran.data.augment import Augmentation
 from raytran.data.cache import MaskCache
 from raytran.data.images import MIN_VIEWS
 from raytran.data.scan2cad import SceneAnnotation, read_annotations, scene_objects
@@ -22,10 +23,13 @@ from raytran.data.views import choose_even, choose_random
 from raytran.errors import ConfigError, DataError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.types import ObjectSet, SceneBatch
+from raytran.types import ObjectSet, SceneBatch, Views
 
 TARGETS: tuple[str, ...] = ("objects", "shapes", "occupancy", "foreground")
 """Targets a data set can give; "shapes" gives the objects too."""
+
+_DROPOUT, _AUGMENTATION = 1, 2
+"""What randomness is for, besides the choice of frames."""
 
 
 class SceneDataset(Dataset[SceneBatch]):
@@ -49,7 +53,8 @@ class SceneDataset(Dataset[SceneBatch]):
         targets: some of ``TARGETS``.
         input_mask: whether the amodal mask is given as a fourth channel of the images.
         min_views: fewest different frames of a scene.
-        seed: of the random frames.
+        augmentation: random changes of each scene, for training; None for none.
+        seed: of the random frames and of the augmentation.
 
     Raises:
         ConfigError: unknown targets, or a target whose files are not given.
@@ -72,6 +77,7 @@ class SceneDataset(Dataset[SceneBatch]):
         targets: Collection[str] = TARGETS,
         input_mask: bool = False,
         min_views: int = MIN_VIEWS,
+        augmentation: Augmentation | None = None,
         seed: int = 0,
     ) -> None:
         _check(targets, view_choice, annotations, shapenet_root, input_mask)
@@ -86,6 +92,7 @@ class SceneDataset(Dataset[SceneBatch]):
         self._grid_resolution, self._grid_extent = grid_resolution, grid_extent
         self._targets = frozenset(targets)
         self._input_mask = input_mask
+        self._augmentation = augmentation
         self._seed = seed
         # In shared memory, so that workers which outlive an epoch see the next one.
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
@@ -104,27 +111,37 @@ class SceneDataset(Dataset[SceneBatch]):
         Raises:
             DataError: the scan, its images or the CAD models cannot be read.
         """
-        scene_id = self.scene_ids[index]
-        scan = self._scan(scene_id)
+        scan = self._scan(self.scene_ids[index])
         views, used = scan_views(
             scan, self._choose(len(scan), index), image_size=self._image_size, min_views=self._min_views
         )
+        scene = self._scene(scan, views, used)
+        if self._augmentation is not None:
+            scene = self._augmentation(scene, self._generator(index, _AUGMENTATION))
+        objects = () if scene.objects is None else scene.objects
+        wanted = self._targets & {"objects", "shapes"}
+        return replace(
+            scene,
+            objects=tuple(self._without_unasked(part) for part in objects) if wanted else None,
+            occupancy=self._occupancy(objects[0], scene.grid_center[0]) if objects else None,
+            foreground=scene.foreground if "foreground" in self._targets else None,
+        )
+
+    def _scene(self, scan: Scan, views: Views, used: Sequence[int]) -> SceneBatch:
+        """Return a scene as it is on disk, with its objects, and masks if they are wanted."""
         cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], self._image_size)
-        grid_center = cameras.position.mean(dim=0)
-        objects = self._objects(scene_id)
+        objects = self._objects(scan.scene_id)
         foreground = self._foreground(objects, cameras)
         if self._input_mask and foreground is not None:
-            views = replace(
-                views, images=torch.cat([views.images, foreground[:, :, None].byte() * 255], dim=2)
-            )
+            mask = foreground[:, :, None].byte() * 255
+            views = replace(views, images=torch.cat([views.images, mask], dim=2))
         return SceneBatch(
-            scene_id=(scene_id,),
+            scene_id=(scan.scene_id,),
             views=views,
             frame_id=(tuple(scan.frame_id[i] for i in used),),
-            grid_center=grid_center[None],
-            objects=(self._without_unasked(objects),) if self._targets & {"objects", "shapes"} else None,
-            occupancy=self._occupancy(objects, grid_center),
-            foreground=foreground if "foreground" in self._targets else None,
+            grid_center=cameras.position.mean(dim=0, keepdim=True),
+            objects=(objects,),
+            foreground=foreground,
         )
 
     def _scan(self, scene_id: str) -> Scan:
@@ -134,10 +151,18 @@ class SceneDataset(Dataset[SceneBatch]):
 
     def _choose(self, n: int, index: int) -> list[int]:
         if self._view_choice == "even":
-            return choose_even(n, self._num_views).tolist()
-        state = np.random.SeedSequence([self._seed, int(self._epoch), index]).generate_state(1, np.uint64)
-        generator = torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
-        return choose_random(n, self._num_views, generator).tolist()
+            chosen = choose_even(n, self._num_views).tolist()
+        else:
+            chosen = choose_random(n, self._num_views, self._generator(index)).tolist()
+        if self._augmentation is None:
+            return chosen
+        return self._augmentation.drop_frames(chosen, self._min_views, self._generator(index, _DROPOUT))
+
+    def _generator(self, index: int, *purpose: int) -> torch.Generator:
+        """Return the source of randomness of scene ``index`` in this epoch, one for each purpose."""
+        seeds = np.random.SeedSequence([self._seed, int(self._epoch), index, *purpose])
+        state = seeds.generate_state(1, np.uint64)
+        return torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
 
     def _objects(self, scene_id: str) -> ObjectSet:
         if scene_id not in self._annotations:

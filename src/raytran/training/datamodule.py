@@ -11,6 +11,7 @@ from typing import Any
 import lightning.pytorch as pl
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
+from raytran.data.augment import Augmentation
 from raytran.data.collate import collate_scenes
 from raytran.types import SceneBatch
 
@@ -22,7 +23,8 @@ class SceneDataModule(pl.LightningDataModule):
 
     Args:
         root: folder with ``scannet``, ``scan2cad`` and ``shapenet``.
-        dataset: ``dataset(root=…, split="train"|"val", view_choice=…, num_views=…, targets=…)``.
+        dataset: ``dataset(root=…, split="train"|"val", view_choice=…, num_views=…, targets=…,
+            augmentation=…)``.
         targets: what batches must hold, see ``SceneDataset``.
         make: ``make(output=root)`` writes the data and does nothing where they are complete; None if they are
             there in any case.
@@ -30,6 +32,7 @@ class SceneDataModule(pl.LightningDataModule):
         val_views: frames of a validation scene, evenly spread.
         batch_size: scenes per device.
         num_workers: loader processes.
+        augmentation: random changes of training scenes; validation scenes are never changed.
         seed: of the order of the scenes.
     """
 
@@ -44,6 +47,7 @@ class SceneDataModule(pl.LightningDataModule):
         val_views: int = 20,
         batch_size: int = 1,
         num_workers: int = 2,
+        augmentation: Augmentation | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -55,6 +59,7 @@ class SceneDataModule(pl.LightningDataModule):
         self._val_views = val_views
         self._batch_size = batch_size
         self._num_workers = num_workers
+        self._augmentation = augmentation
         self._seed = seed
 
     def prepare_data(self) -> None:
@@ -63,13 +68,14 @@ class SceneDataModule(pl.LightningDataModule):
             self._make(output=self.root)
 
     def split(self, split: str, *, training: bool = False) -> Dataset[SceneBatch]:
-        """Return the scenes of ``train`` or ``val``; with random views for training, else even ones."""
+        """Return the scenes of ``train`` or ``val``; for training with random views and augmented."""
         return self._dataset(
             root=self.root,
             split=split,
             targets=self._targets,
             view_choice="random" if training else "even",
             num_views=self._num_views if training else self._val_views,
+            augmentation=self._augmentation if training else None,
         )
 
     def train_dataloader(self) -> DataLoader[SceneBatch]:
