@@ -4,7 +4,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import struct
+import zlib
+from collections.abc import Callable, Sequence
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +61,65 @@ def write_scan(tmp_path: Path) -> Callable[..., Path]:
             np.savetxt(folder / "pose" / f"{n}.txt", look_along_x(n / 100))
         np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", INTRINSICS)
         return folder
+
+    return write
+
+
+def encode_color(pixels: np.ndarray, kind: str) -> bytes:
+    """Pack ``(H, W, 3)`` pixels as a recording of colour ``kind`` does."""
+    if kind == "raw":
+        return pixels.tobytes()
+    stream = BytesIO()
+    Image.fromarray(pixels).save(stream, format=kind)
+    return stream.getvalue()
+
+
+def encode_sens(
+    color: Sequence[bytes],
+    depth: Sequence[bytes],
+    poses: np.ndarray,
+    *,
+    color_kind: int = 2,
+    depth_kind: int = 1,
+    color_size: tuple[int, int] = (32, 48),
+    depth_size: tuple[int, int] = (6, 8),
+    intrinsics: np.ndarray = INTRINSICS,
+    imu: bool = True,
+    stated: int | None = None,
+    name: bytes = b"StructureSensor",
+    version: int = 4,
+) -> bytes:
+    """Put together a ``.sens`` file of version 4, field by field as ScanNet's sensorData.h writes it."""
+    out = bytearray(struct.pack("<IQ", version, len(name)) + name)
+    for matrix in (intrinsics, np.eye(4), np.diag([5.0, 5, 1, 1]), np.eye(4)):
+        out += matrix.astype("<f4").tobytes()
+    out += struct.pack("<ii", color_kind, depth_kind)
+    out += struct.pack("<IIII", *color_size[::-1], *depth_size[::-1])
+    out += struct.pack("<fQ", 1000.0, len(color) if stated is None else stated)
+    for number, (color_blob, depth_blob, pose) in enumerate(zip(color, depth, poses, strict=True)):
+        out += pose.astype("<f4").tobytes()
+        out += struct.pack("<QQQQ", number * 33333, number * 33333 + 7, len(color_blob), len(depth_blob))
+        out += color_blob + depth_blob
+    if imu:
+        out += struct.pack("<Q", 2) + bytes(2 * 128)
+    return bytes(out)
+
+
+@pytest.fixture
+def write_sens(tmp_path: Path) -> Callable[..., Path]:
+    """Write a JPEG + zlib recording of the scan of ``write_scan``; frames in ``lost`` have a pose of -inf."""
+
+    def write(
+        scene_id: str = "scene0000_00", frames: int = 4, lost: Sequence[int] = (), root: Path = tmp_path
+    ) -> Path:
+        path = root / "scannet" / "scans" / scene_id / f"{scene_id}.sens"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        color = [encode_color(np.full((32, 48, 3), n, np.uint8), "jpeg") for n in range(frames)]
+        depth = [zlib.compress(np.full((6, 8), 1000 + n, "<u2").tobytes()) for n in range(frames)]
+        poses = np.stack([look_along_x(n / 100) for n in range(frames)])
+        poses[list(lost)] = -np.inf
+        path.write_bytes(encode_sens(color, depth, poses))
+        return path
 
     return write
 
