@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import io
 import pickle
 import shutil
 
@@ -10,6 +11,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
+from raytran.data import dataset as dataset_module
 from raytran.data.augment import Augmentation
 from raytran.data.collate import collate_scenes
 from raytran.data.dataset import SceneDataset, scan2cad_dataset
@@ -185,6 +187,42 @@ def test_dataset_can_be_pickled(long_dataset) -> None:
     dataset = open_dataset(long_dataset, num_views=6, targets=())
     dataset.set_epoch(5)
     assert pickle.loads(pickle.dumps(dataset))[0].frame_id == dataset[0].frame_id
+
+
+def test_annotation_is_read_once(long_dataset, monkeypatch) -> None:
+    read = []
+    real = dataset_module.read_annotations
+    monkeypatch.setattr(dataset_module, "read_annotations", lambda path: read.append(path) or real(path))
+    (long_dataset / "scannet" / "scannetv2_train.txt").write_text("scene0001_00\n")
+    open_dataset(long_dataset)
+    assert len(read) == 1
+
+
+def test_dataset_holds_few_tensors_however_many_scenes(long_dataset, write_annotations, cube_entry) -> None:
+    """A worker process that is not forked gets each tensor by a file handle of its own."""
+    scans = long_dataset / "scannet" / "scans"
+    names = [f"scene{i:04d}_00" for i in range(300)]
+    for name in names[2:]:
+        (scans / name).symlink_to(scans / names[0])
+    write_annotations({name: [cube_entry()] for name in names})
+    dataset = open_dataset(long_dataset, num_views=6)
+    for i in range(20):
+        dataset[i]
+    assert len(dataset) == 300
+    tensors = []
+
+    class Pickler(pickle.Pickler):
+        def reducer_override(self, value):
+            tensors.extend([value] if isinstance(value, torch.Tensor) else [])
+            return NotImplemented
+
+    content = io.BytesIO()
+    Pickler(content).dump(dataset)
+    assert len(tensors) < 10
+    assert len(content.getvalue()) < 100_000
+    copy = pickle.loads(content.getvalue())
+    assert copy[299].scene_id == (names[299],)
+    assert copy[299].frame_id == dataset[299].frame_id
 
 
 def test_scan_with_too_few_frames_repeats_them(cube_dataset) -> None:
