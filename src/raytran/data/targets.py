@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from raytran.data.cache import MaskCache, digest, file_digest
-from raytran.data.shapenet import STEM, model_folder, read_mesh
+from raytran.data.shapenet import mesh_path, read_mesh
 from raytran.data.voxelize import voxelize_solid
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
@@ -111,7 +111,7 @@ def foreground_masks(
 
 def _content(shapenet_root: Path, model_id: str) -> str:
     """Return a digest of a model's mesh file."""
-    return file_digest(model_folder(shapenet_root, *model_id.split("/")) / f"{STEM}.obj")
+    return file_digest(mesh_path(shapenet_root, *model_id.split("/")))
 
 
 @lru_cache(maxsize=64)

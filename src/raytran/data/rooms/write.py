@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from raytran.data.rooms.placed import PlacedObject
 from raytran.data.rooms.scene import Scene
-from raytran.data.shapenet import write_model
+from raytran.data.shapenet_write import write_model
 
 FRAME_STEP = 10
 """Distance of the written frames' numbers, as in exports that keep every tenth frame of a video."""
