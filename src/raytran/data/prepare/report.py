@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a prepared folder holds and what was left out of it, as numbers, as names, and as text."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from raytran.data.atomic import bytes_below
+from raytran.data.prepare.annotation import Annotations, Entry, LeftOut
+from raytran.data.prepare.scan import read_facts
+from raytran.data.prepare.selection import Selection
+from raytran.data.scan2cad import parse_entry, scene_objects
+from raytran.types import CLASSES
+
+
+def make_report(
+    output: Path,
+    scans: Sequence[str],
+    entries: Mapping[str, Entry],
+    *,
+    selection: Selection,
+    annotations: Annotations | None,
+    left_out: Sequence[LeftOut],
+    failed: Mapping[str, str],
+    without_objects: Sequence[str],
+    grid_extent: tuple[float, float, float],
+) -> dict[str, Any]:
+    """Collect what is known about a prepared folder; the same files give the same report.
+
+    Args:
+        output: the prepared folder.
+        scans: names of the prepared scans.
+        entries: prepared annotation of those that have one.
+        selection: what was chosen to be prepared.
+        annotations: what the annotation file held; None if there was none.
+        left_out: objects without a usable CAD file.
+        failed: scans that cannot be used, and why.
+        without_objects: scans none of whose objects can be used.
+        grid_extent: sizes of the volume, metres.
+    """
+    facts = {scan: read_facts(output, scan) for scan in scans}
+    membership = {split: [s for s in listed if s in facts] for split, listed in selection.splits.items()}
+    found = annotations or Annotations()
+    return {
+        "scans": {"prepared": len(scans), **{split: len(names) for split, names in membership.items()}},
+        "objects": _objects_by_class(entries, membership or {"all": list(scans)}),
+        "frames": _frames(facts),
+        "size": _sizes(output, facts),
+        "left_out": {
+            "scans_failed": dict(sorted(failed.items())),
+            "scans_without_annotation": selection.without_annotation,
+            "scans_annotated_without_objects": sorted(found.empty),
+            "scans_without_usable_objects": list(without_objects),
+            "annotations_without_scan": selection.without_scan,
+            "scans_in_no_split": selection.in_no_split,
+            "objects": [asdict(part) for part in (*found.left_out, *left_out)],
+        },
+        "noticed": {
+            "duplicate_scans": selection.duplicates,
+            "duplicate_annotations": found.twice,
+            "recordings_cut_short": _facts_that_say("cut", facts),
+            "other_source_used": _facts_that_say("failed_sources", facts),
+            "objects_outside_volume": _outside(facts, entries, grid_extent),
+            "damaged_images": _facts_that_say("damaged", facts),
+        },
+    }
+
+
+def _facts_that_say(key: str, facts: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+    return {scan: f[key] for scan, f in facts.items() if f[key]}
+
+
+def _objects_by_class(
+    entries: Mapping[str, Entry], membership: Mapping[str, Sequence[str]]
+) -> dict[str, dict[str, int]]:
+    """Return the number of objects of each class, by split."""
+    table = {}
+    for split, scans in membership.items():
+        labels: Counter[int] = Counter()
+        for scan in scans:
+            if scan in entries:
+                labels.update(scene_objects(parse_entry(entries[scan])).label.tolist())
+        table[split] = {name: labels[index] for index, name in enumerate(CLASSES)}
+    return table
+
+
+def _frames(facts: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+    reasons = Counter(reason for f in facts.values() for reason in f["dropped"].values())
+    return {
+        "in_scans": sum(f["frames"] for f in facts.values()),
+        "written": sum(f["written"] for f in facts.values()),
+        "dropped": dict(sorted(reasons.items())),
+        "damaged_images": sum(len(f["damaged"]) for f in facts.values()),
+        "stored_sizes": dict(
+            sorted(Counter("x".join(map(str, f["stored_size"][::-1])) for f in facts.values()).items())
+        ),
+        "forms": dict(sorted(Counter(f["form"] for f in facts.values()).items())),
+    }
+
+
+def _sizes(output: Path, facts: Mapping[str, dict[str, Any]]) -> dict[str, int]:
+    """Return bytes of files; those of the frames from the scans' facts, for there are many."""
+    return {
+        "color_bytes": sum(f["bytes"] for f in facts.values()),
+        "model_bytes": bytes_below(output / "shapenet"),
+        "target_bytes": bytes_below(output / "cache"),
+    }
+
+
+def _outside(
+    facts: Mapping[str, dict[str, Any]], entries: Mapping[str, Entry], extent: tuple[float, float, float]
+) -> dict[str, list[str]]:
+    """Return the models whose centre is not in the volume around the mean of all cameras, by scan."""
+    half = torch.tensor(extent, dtype=torch.float64) / 2
+    outside = {}
+    for scan in facts.keys() & entries.keys():
+        objects = scene_objects(parse_entry(entries[scan]))
+        offset = objects.center.double() - torch.tensor(facts[scan]["camera_center"], dtype=torch.float64)
+        far = (offset.abs() > half).any(dim=1).tolist()
+        names = [name for name, is_far in zip(objects.model_id, far, strict=True) if is_far]
+        if names:
+            outside[scan] = names
+    return dict(sorted(outside.items()))
