@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,59 +14,64 @@ import torch
 from raytran.data.atomic import bytes_below
 from raytran.data.prepare.annotation import Annotations, Entry, LeftOut
 from raytran.data.prepare.scan import read_facts
-from raytran.data.prepare.selection import Selection
+from raytran.data.prepare.sources import Sources
 from raytran.data.scan2cad import parse_entry, scene_objects
 from raytran.types import CLASSES
 
 
+@dataclass(frozen=True)
+class Outcome:
+    """What a preparation led to.
+
+    Attributes:
+        scans: prepared scans, those of earlier calls among them.
+        entries: annotation of those that have one.
+        left_out: objects without a usable CAD file.
+        without_objects: scans that are not prepared because none of their objects can be used.
+        failed: scans that cannot be used, and why.
+    """
+
+    scans: Sequence[str]
+    entries: Mapping[str, Entry]
+    left_out: Sequence[LeftOut]
+    without_objects: Sequence[str]
+    failed: Mapping[str, str]
+
+
 def make_report(
-    output: Path,
-    scans: Sequence[str],
-    entries: Mapping[str, Entry],
-    *,
-    selection: Selection,
-    annotations: Annotations | None,
-    left_out: Sequence[LeftOut],
-    failed: Mapping[str, str],
-    without_objects: Sequence[str],
-    grid_extent: tuple[float, float, float],
+    output: Path, sources: Sources, outcome: Outcome, *, grid_extent: tuple[float, float, float]
 ) -> dict[str, Any]:
     """Collect what is known about a prepared folder; the same files give the same report.
 
     Args:
         output: the prepared folder.
-        scans: names of the prepared scans.
-        entries: prepared annotation of those that have one.
-        selection: what was chosen to be prepared.
-        annotations: what the annotation file held; None if there was none.
-        left_out: objects without a usable CAD file.
-        failed: scans that cannot be used, and why.
-        without_objects: scans none of whose objects can be used.
+        sources: what it was prepared from.
+        outcome: what became of it.
         grid_extent: sizes of the volume, metres.
     """
-    facts = {scan: read_facts(output, scan) for scan in scans}
+    selection, found = sources.selection, sources.annotations or Annotations()
+    facts = {scan: read_facts(output, scan) for scan in outcome.scans}
     membership = {split: [s for s in listed if s in facts] for split, listed in selection.splits.items()}
-    found = annotations or Annotations()
     return {
-        "scans": {"prepared": len(scans), **{split: len(names) for split, names in membership.items()}},
-        "objects": _objects_by_class(entries, membership or {"all": list(scans)}),
+        "scans": {"prepared": len(facts)} | {split: len(names) for split, names in membership.items()},
+        "objects": _objects_by_class(outcome.entries, membership or {"all": list(facts)}),
         "frames": _frames(facts),
         "size": _sizes(output, facts),
         "left_out": {
-            "scans_failed": dict(sorted(failed.items())),
+            "scans_failed": dict(sorted(outcome.failed.items())),
             "scans_without_annotation": selection.without_annotation,
             "scans_annotated_without_objects": sorted(found.empty),
-            "scans_without_usable_objects": list(without_objects),
+            "scans_without_usable_objects": list(outcome.without_objects),
             "annotations_without_scan": selection.without_scan,
             "scans_in_no_split": selection.in_no_split,
-            "objects": [asdict(part) for part in (*found.left_out, *left_out)],
+            "objects": [asdict(part) for part in (*found.left_out, *outcome.left_out)],
         },
         "noticed": {
             "duplicate_scans": selection.duplicates,
             "duplicate_annotations": found.twice,
             "recordings_cut_short": _facts_that_say("cut", facts),
             "other_source_used": _facts_that_say("failed_sources", facts),
-            "objects_outside_volume": _outside(facts, entries, grid_extent),
+            "objects_outside_volume": _outside(facts, outcome.entries, grid_extent),
             "damaged_images": _facts_that_say("damaged", facts),
         },
     }

@@ -15,7 +15,7 @@ from raytran.data.atomic import write_json, write_text
 from raytran.data.prepare.annotation import ANNOTATIONS, Entry, used_models, without_models
 from raytran.data.prepare.estimate import estimate
 from raytran.data.prepare.models import prepare_model
-from raytran.data.prepare.report import make_report
+from raytran.data.prepare.report import Outcome, make_report
 from raytran.data.prepare.report_text import report_text
 from raytran.data.prepare.scan import ScanJob, prepare_scan, scan_folder
 from raytran.data.prepare.settings import PrepareSettings
@@ -77,17 +77,9 @@ class Preparation:
         failed = self._prepare_scans(jobs)
         scans = self._finished()
         self._write_lists(scans, entries)
-        report = make_report(
-            self.output,
-            scans,
-            {scan: entries[scan] for scan in scans if scan in entries},
-            selection=self.sources.selection,
-            annotations=self.sources.annotations,
-            left_out=left_out,
-            failed=failed,
-            without_objects=without_objects,
-            grid_extent=grid_extent,
-        )
+        prepared = {scan: entries[scan] for scan in scans if scan in entries}
+        outcome = Outcome(scans, prepared, left_out, without_objects, failed)
+        report = make_report(self.output, self.sources, outcome, grid_extent=grid_extent)
         write_json(self.output / "report.json", report)
         write_text(self.output / "report.txt", report_text(report))
         return report
