@@ -4,15 +4,15 @@
 from __future__ import annotations
 
 import json
-import struct
 import zlib
 from collections.abc import Callable, Sequence
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+
+from .scan_forms import INTRINSICS, encode_color, encode_sens, look_along_x, write_form
 
 CUBE_OBJ = """v -0.5 -0.5 -0.5
 v 0.5 -0.5 -0.5
@@ -36,17 +36,6 @@ f 2 3 7
 f 2 7 6
 """
 
-INTRINSICS = np.array([[40.0, 0, 24, 0], [0, 40, 16, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-"""For images of 48×32."""
-
-
-def look_along_x(x: float) -> np.ndarray:
-    """A camera at (x, 0, 1) that looks along the world's +x, upright."""
-    pose = np.eye(4)
-    pose[:3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], dtype=float)
-    pose[:3, 3] = (x, 0, 1)
-    return pose
-
 
 @pytest.fixture
 def write_scan(tmp_path: Path) -> Callable[..., Path]:
@@ -65,46 +54,6 @@ def write_scan(tmp_path: Path) -> Callable[..., Path]:
     return write
 
 
-def encode_color(pixels: np.ndarray, kind: str) -> bytes:
-    """Pack ``(H, W, 3)`` pixels as a recording of colour ``kind`` does."""
-    if kind == "raw":
-        return pixels.tobytes()
-    stream = BytesIO()
-    Image.fromarray(pixels).save(stream, format=kind)
-    return stream.getvalue()
-
-
-def encode_sens(
-    color: Sequence[bytes],
-    depth: Sequence[bytes],
-    poses: np.ndarray,
-    *,
-    color_kind: int = 2,
-    depth_kind: int = 1,
-    color_size: tuple[int, int] = (32, 48),
-    depth_size: tuple[int, int] = (6, 8),
-    intrinsics: np.ndarray = INTRINSICS,
-    imu: bool = True,
-    stated: int | None = None,
-    name: bytes = b"StructureSensor",
-    version: int = 4,
-) -> bytes:
-    """Put together a ``.sens`` file of version 4, field by field as ScanNet's sensorData.h writes it."""
-    out = bytearray(struct.pack("<IQ", version, len(name)) + name)
-    for matrix in (intrinsics, np.eye(4), np.diag([5.0, 5, 1, 1]), np.eye(4)):
-        out += matrix.astype("<f4").tobytes()
-    out += struct.pack("<ii", color_kind, depth_kind)
-    out += struct.pack("<IIII", *color_size[::-1], *depth_size[::-1])
-    out += struct.pack("<fQ", 1000.0, len(color) if stated is None else stated)
-    for number, (color_blob, depth_blob, pose) in enumerate(zip(color, depth, poses, strict=True)):
-        out += pose.astype("<f4").tobytes()
-        out += struct.pack("<QQQQ", number * 33333, number * 33333 + 7, len(color_blob), len(depth_blob))
-        out += color_blob + depth_blob
-    if imu:
-        out += struct.pack("<Q", 2) + bytes(2 * 128)
-    return bytes(out)
-
-
 @pytest.fixture
 def write_sens(tmp_path: Path) -> Callable[..., Path]:
     """Write a JPEG + zlib recording of the scan of ``write_scan``; frames in ``lost`` have a pose of -inf."""
@@ -116,10 +65,22 @@ def write_sens(tmp_path: Path) -> Callable[..., Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         color = [encode_color(np.full((32, 48, 3), n, np.uint8), "jpeg") for n in range(frames)]
         depth = [zlib.compress(np.full((6, 8), 1000 + n, "<u2").tobytes()) for n in range(frames)]
-        poses = np.stack([look_along_x(n / 100) for n in range(frames)])
+        poses = np.array([look_along_x(n / 100) for n in range(frames)]).reshape(-1, 4, 4)
         poses[list(lost)] = -np.inf
         path.write_bytes(encode_sens(color, depth, poses))
         return path
+
+    return write
+
+
+@pytest.fixture
+def scan_in_form(write_scan, tmp_path: Path) -> Callable[..., Path]:
+    """Write the scan of ``write_scan`` to a folder in one of the exported forms."""
+
+    def write(form: str, folder: Path, frames: Sequence[int] = (0, 10, 20, 100)) -> Path:
+        plain = tmp_path / f"plain-{folder.parent.name}-{form}"
+        write_form(form, write_scan(folder.name, frames, root=plain), folder)
+        return folder
 
     return write
 

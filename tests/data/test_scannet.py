@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 import pytest
 import torch
 from PIL import Image
 
-from raytran.data.scannet import load_views, read_scan
+from raytran.data.scannet import load_views, open_scan, read_scan, read_sens
 from raytran.errors import DataError
 
 
@@ -131,6 +133,92 @@ def test_truncated_images_are_skipped_until_too_few_remain(write_scan) -> None:
     path.write_bytes(path.read_bytes()[:-50])
     with pytest.raises(DataError, match="only 1 of 3"):
         load_views(folder, image_size=(32, 48), num_views=3)
+
+
+def test_a_recording_gives_the_views_of_its_export(write_sens, write_scan) -> None:
+    path = write_sens(frames=4, lost=[1])
+    export = write_scan("scene0009_00", frames=(0, 2, 3))
+    expected, _ = load_views(export, image_size=(16, 24), num_views=3)
+    for place in (path, path.parent, str(path)):
+        views, frame_id = load_views(place, image_size=(16, 24), num_views=3)
+        assert frame_id == ("0", "2", "3")
+        torch.testing.assert_close(views.world_from_camera, expected.world_from_camera, rtol=0, atol=1e-7)
+        assert torch.equal(views.intrinsics, expected.intrinsics)
+        # The recording's images are of another JPEG quality.
+        assert (views.images.int() - expected.images.int()).abs().max() <= 1
+
+
+def test_a_recording_drops_what_an_export_drops(write_sens) -> None:
+    path = write_sens(frames=5, lost=[0, 3])
+    (path.parent / "scene0000_00.txt").write_text("axisAlignment = 1 0 0 5 0 1 0 0 0 0 1 0 0 0 0 1\n")
+    with read_sens(path) as scan:
+        assert (scan.scene_id, scan.frame_id) == ("scene0000_00", ("1", "2", "4"))
+        rigid = "pose is not finite or no rigid motion"
+        assert scan.dropped == {"0": rigid, "3": rigid}
+        assert scan.world_from_camera[:, 0, 3].tolist() == pytest.approx([0.01, 0.02, 0.04])
+        assert scan.image_size == (32, 48)
+        assert scan.axis_alignment[0, 3] == 5
+        assert scan.damage is None
+        assert scan.read_color(2)[0, 0].tolist() == [4, 4, 4]
+    with pytest.raises(ValueError, match="closed file"):
+        scan.read_color(0)
+
+
+def test_a_cut_recording_gives_the_frames_before_and_says_so(write_sens, caplog) -> None:
+    path = write_sens(frames=5, lost=[1])
+    path.write_bytes(path.read_bytes()[: -2 * 128 - 8 - 10])
+    with caplog.at_level(logging.WARNING), read_sens(path) as scan:
+        assert scan.frame_id == ("0", "2", "3")
+        assert scan.dropped["4"] == "the file ends within this frame"
+        assert scan.damage == caplog.messages[0]
+        assert "ends within frame 4 of the 5 that its header promises" in scan.damage
+
+
+def test_recordings_without_a_usable_frame(write_sens) -> None:
+    path = write_sens(frames=3, lost=[0, 1, 2])
+    with pytest.raises(
+        DataError, match=r"none of the 3 frames in .*scene0000_00\.sens has an image and a valid"
+    ):
+        read_sens(path)
+    path = write_sens("scene0001_00", frames=0)
+    with pytest.raises(DataError, match="none of the 0 frames"):
+        read_sens(path)
+
+
+def test_exported_frames_go_before_a_recording_of_the_same_folder(write_sens, write_scan) -> None:
+    write_scan()
+    path = write_sens(frames=6)
+    with open_scan(path.parent) as scan:
+        assert scan.frame_id == ("0", "10", "20", "100")
+        assert scan.path == path.parent
+    with pytest.raises(DataError, match=r"there is no scan folder .*nowhere"):
+        open_scan(path.parent / "nowhere")
+
+
+def test_a_header_may_lie_elsewhere_and_state_no_size(write_scan, tmp_path) -> None:
+    header = tmp_path / "elsewhere.txt"
+    header.write_text("colorWidth = 0\ncolorHeight = 0\naxisAlignment = 1 0 0 2 0 1 0 0 0 0 1 0 0 0 0 1\n")
+    assert read_scan(write_scan(), header=header).axis_alignment[0, 3] == 2
+    header.write_text("axisAlignment = one\n")
+    with pytest.raises(DataError, match=r"axisAlignment in .*elsewhere\.txt"):
+        read_scan(write_scan("scene0001_00"), header=header)
+
+
+def test_damaged_images_are_named_when_they_are_read(write_scan) -> None:
+    folder = write_scan(frames=(0, 10, 20))
+    scan = read_scan(folder)
+    (folder / "color" / "0.jpg").write_bytes(b"no image")
+    Image.new("RGB", (8, 8)).save(folder / "color" / "10.jpg")
+    (folder / "color" / "20.jpg").unlink()
+    for index, reason in (
+        (0, "cannot read the image"),
+        (1, r"10\.jpg is 8x8, not 48x32"),
+        (2, "cannot read"),
+    ):
+        with pytest.raises(DataError, match=reason):
+            scan.read_color(index)
+    with pytest.raises(DataError, match=r"cannot read the image .*20\.jpg \(No such file"):
+        scan.color_bytes(2)
 
 
 def test_real_scan_with_lost_frames(shared_dir) -> None:

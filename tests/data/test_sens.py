@@ -15,7 +15,7 @@ from PIL import Image
 from raytran.data.sens import SensFile
 from raytran.errors import DataError
 
-from .conftest import INTRINSICS, encode_color, encode_sens
+from .scan_forms import INTRINSICS, encode_color, encode_sens
 
 COLOR = {"raw": 0, "png": 1, "jpeg": 2}
 DEPTH = {"raw": 0, "zlib": 1, "occi": 2}

@@ -151,6 +151,7 @@ class _Walk:
         """Yield the sources in a folder; the inside of a scan is not searched."""
         try:
             listing = Listing.of(folder)
+            layout = recognise(listing)
             entry = folder.stat()
         except (DataError, OSError) as error:
             _log.warning("skipped a folder: %s", error)
@@ -163,7 +164,6 @@ class _Walk:
         for name in recordings:
             beside = folder / f"{name}.txt" if f"{name}.txt" in listing.files else None
             yield ScanSource(name, "sens", folder / f"{name}.sens", beside)
-        layout = recognise(listing)
         if layout is not None:
             yield ScanSource(scene_id, layout.form, folder, header)
         is_scan = layout is not None or scene_id in recordings

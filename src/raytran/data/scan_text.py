@@ -12,6 +12,9 @@ from torch import Tensor
 
 from raytran.errors import DataError
 
+INFO_FILES = ("_info.txt", "info.txt")
+"""Names of the C++ exporter's file of facts."""
+
 _OFF_CENTRE = 0.15
 """Largest distance of the principal point from the image centre, in widths or heights."""
 
@@ -74,10 +77,6 @@ def read_intrinsics(path: Path) -> NDArray[np.float64]:
         state = "does not hold a 4x4 or 3x3 camera matrix" if path.is_file() else "is missing"
         raise DataError(f"{path} {state}: write fx, fy, cx, cy of the stored colour images there as 4x4")
     return matrix
-
-
-INFO_FILES = ("_info.txt", "info.txt")
-"""Names of the C++ exporter's file of facts."""
 
 
 def check_intrinsics(
