@@ -205,8 +205,9 @@ def change_colors(images: Tensor, matrix: Tensor, offset: Tensor) -> Tensor:
     changed[..., 3:, :, :] = images[..., 3:, :, :]
     # Half a grey level more, so that cutting off the fraction rounds; image by image, to stay in the cache.
     offset = (offset + 0.5)[:, None]
+    color = torch.empty(3, math.prod(images.shape[-2:]))
     for old, new in zip(images.flatten(0, -4), changed.flatten(0, -4), strict=True):
-        color = torch.addmm(offset, matrix, old[:3].flatten(1).float())
+        torch.addmm(offset, matrix, old[:3].flatten(1).float(), out=color)
         # numpy casts seven times as fast as torch.
         np.copyto(new[:3].flatten(1).numpy(), color.clamp_(0, 255).numpy(), casting="unsafe")
     return changed
