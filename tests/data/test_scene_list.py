@@ -50,20 +50,24 @@ def test_a_scan_is_read_again_only_when_others_took_its_place(write_scan, tmp_pa
 
     real = scene_list.read_scan
     monkeypatch.setattr(scene_list, "read_scan", spy)
-    scans = RecentScans(tmp_path / "scannet" / "scans", max_frames=8)
+    folder = tmp_path / "scannet" / "scans"
+    size = len(pickle.dumps(real(folder / "a")))
+    scans = RecentScans(folder, max_bytes=int(2.5 * size))
     for name in ("a", "b", "a", "c", "a", "b"):
         assert scans[name].scene_id == name
+        assert torch.equal(scans[name].world_from_camera, real(folder / name).world_from_camera)
+        assert scans[name].image_path == real(folder / name).image_path
     # c takes the place of b, which was not used for longest.
     assert read == ["a", "b", "c", "b"]
     assert len(scans) == 2
     assert len(pickle.loads(pickle.dumps(scans))) == 0
 
 
-def test_a_scan_larger_than_the_limit_is_kept_alone(write_scan, tmp_path) -> None:
+def test_a_scan_beyond_the_limit_is_not_kept(write_scan, tmp_path) -> None:
     write_scan("a", frames=range(4))
-    scans = RecentScans(tmp_path / "scannet" / "scans", max_frames=2)
-    assert scans["a"] is scans["a"]
-    assert len(scans) == 1
+    scans = RecentScans(tmp_path / "scannet" / "scans", max_bytes=10)
+    assert len(scans["a"]) == len(scans["a"]) == 4
+    assert len(scans) == 0
 
 
 def test_scans_that_are_not_there(write_scan, tmp_path) -> None:

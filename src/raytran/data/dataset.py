@@ -29,8 +29,8 @@ from raytran.types import ObjectSet, SceneBatch, Views
 TARGETS: tuple[str, ...] = ("objects", "shapes", "occupancy", "foreground")
 """Targets a data set can give; "shapes" gives the objects too."""
 
-_FRAMES_IN_MEMORY = 50_000
-"""Most frames of which a data set keeps the cameras and file names in each process, about 30 MB."""
+_MEMORY_OF_SCANS = 64 * 2**20
+"""Bytes in which each process keeps cameras and file names: 300,000 frames, all of ScanNet at 200 a scan."""
 
 _DROPOUT, _AUGMENTATION = 1, 2
 """What randomness is for, besides the choice of frames."""
@@ -90,7 +90,7 @@ class SceneDataset(Dataset[SceneBatch]):
         if isinstance(annotations, str | Path):
             annotations = read_annotations(Path(annotations))
         self.scene_ids = choose_scenes(Path(scans_root), scene_ids, annotations)
-        self._scans = RecentScans(Path(scans_root), _FRAMES_IN_MEMORY)
+        self._scans = RecentScans(Path(scans_root), _MEMORY_OF_SCANS)
         self._objects_of = ObjectTable([_objects_in(annotations, scene_id) for scene_id in self.scene_ids])
         self._shapenet_root = None if shapenet_root is None else Path(shapenet_root)
         self._cache = MaskCache(folder=Path(cache_dir))
