@@ -14,6 +14,7 @@ from raytran.data.prepare import PrepareSettings, Released, prepare_scan2cad
 from raytran.data.rooms.generate import generate_rooms
 from raytran.errors import ConfigError
 from raytran.run.build import plain
+from raytran.run.check import check
 
 _log = logging.getLogger(__name__)
 
@@ -40,6 +41,8 @@ def prepare(cfg: DictConfig) -> Any:
         ConfigError: the data set is unknown, or a path is missing.
         DataError: the input is missing or damaged, or ``output`` was begun with other settings.
     """
+    if cfg.check is not None:
+        return check(cfg)
     if cfg.dataset not in _DATASETS:
         raise ConfigError(f"unknown dataset={cfg.dataset}: choose one of {', '.join(_DATASETS)}")
     if cfg.output is None:
