@@ -27,6 +27,7 @@ def work_on(
     *,
     label: str,
     processes: int = 0,
+    items_each: int = 1,
     progress: bool = True,
 ) -> Iterator[Result]:
     """Yield ``function(item)`` of each item, in the order in which they are finished.
@@ -38,9 +39,10 @@ def work_on(
         function: a function of a module, or a ``functools.partial`` of one.
         label: name of the progress bar.
         processes: 0 for one per core; 1 works in this process.
+        items_each: fewest items for which another process is worth its start.
         progress: show a progress bar.
     """
-    workers = min(processes or os.cpu_count() or 1, len(items))
+    workers = min(processes or os.cpu_count() or 1, len(items) // items_each)
     columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, disable=not progress or not items) as bar:
         task = bar.add_task(label, total=len(items))

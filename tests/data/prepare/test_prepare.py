@@ -3,8 +3,11 @@ from __future__ import annotations
 
 import errno
 import json
+import multiprocessing
 import os
+import random
 import shutil
+import time
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +16,12 @@ import torch
 from PIL import Image
 
 from raytran.data.dataset import scan2cad_dataset
-from raytran.data.prepare.settings import PrepareSettings
+from raytran.data.prepare import PrepareSettings, Released, prepare_scan2cad
 from raytran.data.scan2cad import read_annotations
 from raytran.data.scannet import read_scan
 from raytran.errors import ConfigError, DataError
 
+SETTINGS = PrepareSettings((16, 24), max_frames=3)
 SCAN = Path("scannet/scans/scene0000_00")
 
 
@@ -105,6 +109,33 @@ def test_a_broken_off_run_is_finished_and_nothing_done_twice(released, prepare, 
     assert digests(out) == digests(tmp_path / "whole")
     assert not [path for path in out.rglob("*") if path.name.startswith(".")]
     assert (out / SCAN / "color" / "0.jpg").stat().st_mtime_ns == kept.st_mtime_ns
+
+
+def test_twenty_kills_at_random_moments(released, prepare, digests, tmp_path):
+    """Whatever is killed, the same command ends with the same bytes. The server imports everything once."""
+    prepare(released, tmp_path / "whole")
+    whole, out = digests(tmp_path / "whole"), tmp_path / "out"
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["raytran.data.prepare"])
+    source = Released(released / "scannet", released / "shapenet", released / "scan2cad")
+    options = {"processes": 1, "progress": False}
+    rng, kills, longest = random.Random(0), 0, 30.0
+    while kills < 20:
+        started = time.monotonic()
+        process = context.Process(target=prepare_scan2cad, args=(out, source, SETTINGS), kwargs=options)
+        process.start()
+        process.join(longest * rng.random() if longest < 30 else longest)
+        if process.exitcode is None:
+            process.kill()
+            process.join()
+            kills += 1
+        else:
+            assert process.exitcode == 0
+            assert digests(out) == whole
+            longest = min(longest, time.monotonic() - started)
+            shutil.rmtree(out)
+    prepare(released, out)
+    assert digests(out) == whole
 
 
 def test_a_part_first_then_the_rest(released, prepare, digests, tmp_path):

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from textwrap import fill
 from typing import Any
 
 from raytran.types import CLASSES
@@ -25,6 +26,7 @@ PAPER_VAL_OBJECTS = {
 """Objects of the validation scans, 3184 in all, derived from the accuracies of RayTran's Table 1."""
 
 _NAMES_SHOWN = 5
+_WIDTH = 100
 _LEFT_OUT = {
     "scans_failed": "scans that cannot be read",
     "scans_without_annotation": "scans without annotation",
@@ -44,14 +46,12 @@ _NOTICED = {
 
 
 def report_text(report: Mapping[str, Any]) -> str:
-    """Return the report as lines of at most 110 characters, names shortened to the first few."""
+    """Return the report as text; of many names the first few, the others are in ``report.json``."""
+    left_out = [line for key, what in _LEFT_OUT.items() for line in _named(what, report["left_out"][key])]
+    left_out += _objects_left_out(report["left_out"]["objects"])
+    noticed = [line for key, what in _NOTICED.items() for line in _named(what, report["noticed"][key])]
     lines = [*_counts(report), "", *_classes(report["objects"]), ""]
-    left_out = [
-        _named(what, report["left_out"].get(key, ())) for key, what in _LEFT_OUT.items()
-    ] + _objects_left_out(report["left_out"]["objects"])
-    noticed = [_named(what, report["noticed"][key]) for key, what in _NOTICED.items()]
-    lines += ["Left out", *(filter(None, left_out) if any(left_out) else ["  nothing"])]
-    lines += ["Noticed", *(filter(None, noticed) if any(noticed) else ["  nothing"])]
+    lines += ["Left out", *(left_out or ["  nothing"]), "Noticed", *(noticed or ["  nothing"])]
     return "\n".join(lines) + "\n"
 
 
@@ -98,12 +98,21 @@ def _objects_left_out(objects: Iterable[Mapping[str, str]]) -> list[str]:
     for part in objects:
         name = f"{part['scan']}: {part['model']}" if part["model"] else part["scan"]
         by_reason.setdefault(part["reason"], []).append(name)
-    return [_named(f"objects ({reason})", names) for reason, names in by_reason.items()]
+    return [line for reason, names in by_reason.items() for line in _named(f"objects: {reason}", names)]
 
 
-def _named(what: str, names: Iterable[str] | Mapping[str, Any]) -> str:
-    names = list(names)
+def _named(what: str, names: Sequence[str] | Mapping[str, Any]) -> list[str]:
+    """Return a line with the count, and the first names, with what is wrong with each where that is known."""
     if not names:
-        return ""
-    more = ", … (all in report.json)" if len(names) > _NAMES_SHOWN else ""
-    return f"  {len(names)} {what}: {', '.join(names[:_NAMES_SHOWN])}{more}"
+        return []
+    known = names if isinstance(names, Mapping) else {}
+    first = list(names)[:_NAMES_SHOWN]
+    rest = [f"… and {len(names) - len(first)} more in report.json"] if len(names) > len(first) else []
+    if any(isinstance(known.get(name), str) for name in first):
+        return [
+            f"  {len(names)} {what}",
+            *(f"    {name}: {known[name]}" for name in first),
+            *(f"    {r}" for r in rest),
+        ]
+    lines = fill(", ".join(first + rest), _WIDTH - 4, break_long_words=False, break_on_hyphens=False)
+    return [f"  {len(names)} {what}", *(f"    {line}" for line in lines.splitlines())]

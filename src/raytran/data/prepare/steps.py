@@ -101,7 +101,11 @@ class Preparation:
         if self.sources.shapenet is None:
             return {}
         copy = partial(prepare_model, source=self.sources.shapenet, output=self.output)
-        return {model: reason for model, reason in self.work(models, copy, label="models") if reason}
+        return {
+            model: reason
+            for model, reason in self.work(models, copy, label="models", items_each=20)
+            if reason
+        }
 
     def _prepare_scans(self, jobs: Sequence[ScanJob]) -> dict[str, str]:
         """Return what is wrong with each scan that cannot be used."""
