@@ -62,13 +62,17 @@ def scene_occupancy(objects: ObjectSet, grid: VoxelGrid) -> Tensor:
     Returns:
         ``(X, Y, Z)`` bool.
     """
-    occupied = torch.zeros(grid.num_voxels, dtype=torch.bool)
+    occupied = np.zeros(grid.num_voxels, dtype=bool)
     if objects.shape is not None:
-        for shape, size, rotation, center in zip(
-            objects.shape, objects.size, objects.rotation, objects.center, strict=True
-        ):
-            occupied[_voxels_of(shape, size, rotation, center, grid)] = True
-    return occupied.reshape(grid.resolution)
+        lower, voxel = grid.lower.double().numpy(), grid.voxel_size.double().numpy()
+        for m, shape in enumerate(objects.shape.numpy()):
+            size, rotation, center = _box_of(objects, m)
+            # Continuous voxel coordinates of the object's cells: origin + voxel_from_cell @ (i, j, k).
+            voxel_from_cell = rotation * (size / len(shape)) / voxel[:, None]
+            origin = (center - rotation @ size / 2 - lower) / voxel
+            cell = size / len(shape) / voxel.min()
+            occupied[_voxels_of(shape, cell, voxel_from_cell, origin, grid.resolution)] = True
+    return torch.from_numpy(occupied.reshape(grid.resolution))
 
 
 def foreground_masks(
@@ -95,9 +99,8 @@ def foreground_masks(
         digest(scene, cameras.image_size, *camera)
         for camera in zip(intrinsics, world_from_camera, strict=True)
     ]
-    stored = [cache.read("foreground", key, cameras.image_size) for key in keys]
-    masks = np.stack([np.zeros(cameras.image_size, dtype=bool) if mask is None else mask for mask in stored])
-    if missing := [i for i, mask in enumerate(stored) if mask is None]:
+    masks, missing = cache.read_stack("foreground", keys, cameras.image_size)
+    if missing:
         meshes = [
             _place(_unit_mesh(shapenet_root, model_id, content), objects, m)
             for m, (model_id, content) in enumerate(zip(objects.model_id, contents, strict=True))
@@ -130,23 +133,66 @@ def _unit_mesh(shapenet_root: Path, model_id: str, _content: str) -> tuple[NDArr
 
 def _place(unit_mesh: tuple[NDArray, NDArray], objects: ObjectSet, m: int) -> tuple[NDArray, NDArray]:
     vertices, faces = unit_mesh
-    size, rotation, center = (t[m].double().numpy() for t in (objects.size, objects.rotation, objects.center))
+    size, rotation, center = _box_of(objects, m)
     return (vertices * size) @ rotation.T + center, faces
 
 
-def _voxels_of(shape: Tensor, size: Tensor, rotation: Tensor, center: Tensor, grid: VoxelGrid) -> Tensor:
-    """Return the number of the voxel of each point that fills an object's solid cells, inside the grid."""
-    cell = size / shape.shape[0]
-    spacing = float(grid.voxel_size.min()) / 2
-    inner = torch.cartesian_prod(
-        *((torch.arange(n) + 0.5) / n for n in (cell / spacing).ceil().int().tolist())
-    )
-    points = (shape.nonzero().T[:, :, None] + inner.T[:, None]).flatten(1)
-    voxel_from_cell = rotation * cell / grid.voxel_size[:, None]
-    origin = (center - rotation @ size / 2 - grid.lower) / grid.voxel_size
-    # One row per axis, in floating point up to the end: a few hundred thousand points for every object.
-    index = torch.addmm(origin[:, None], voxel_from_cell, points).floor_()
-    inside = index[0] >= 0
-    for axis, count in enumerate(grid.resolution):
-        inside &= (index[axis] >= 0) & (index[axis] < count)
-    return grid.flat_index(index[:, inside].T.long())
+def _box_of(objects: ObjectSet, m: int) -> tuple[NDArray, NDArray, NDArray]:
+    """Return size ``(3,)``, rotation ``(3, 3)`` and center ``(3,)`` of object ``m``, float64."""
+    size, rotation, center = (t[m].double().numpy() for t in (objects.size, objects.rotation, objects.center))
+    return size, rotation, center
+
+
+def _voxels_of(
+    shape: NDArray[np.bool_],
+    cell: NDArray[np.float64],
+    voxel_from_cell: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    resolution: tuple[int, int, int],
+) -> NDArray[np.int64]:
+    """Return the numbers of the voxels, inside the grid, of points that fill an object's solid cells.
+
+    Args:
+        shape: ``(S, S, S)`` solid cells.
+        cell: ``(3,)`` sides of a cell in units of the shortest side of a voxel.
+        voxel_from_cell: ``(3, 3)``, as ``origin`` ``(3,)``: the map from cells to voxels.
+        origin: voxel coordinates of the corner of cell (0, 0, 0).
+        resolution: of the grid.
+    """
+    parts = np.maximum(np.ceil(2 * cell), 1).astype(np.int64)
+    if parts.max() > 1:
+        for axis, count in enumerate(parts.tolist()):
+            shape = shape.repeat(count, axis=axis)
+    elif (cell <= 0.25).all():
+        shape = _enough_cells(shape, cell)
+    row, k = np.divmod(np.flatnonzero(shape), shape.shape[2])
+    along = [(np.arange(n) + 0.5) / count for n, count in zip(shape.shape, parts, strict=True)]
+    number = np.zeros(len(k))
+    inside = np.ones(len(k), dtype=bool)
+    for (x, y, z), start, count in zip(voxel_from_cell, origin, resolution, strict=True):
+        place = np.add.outer(along[0] * x + start, along[1] * y).ravel()[row] + (along[2] * z)[k]
+        inside &= (place >= 0) & (place < count)
+        number *= count
+        number += np.floor(place, out=place)
+    return number[inside].astype(np.int64)
+
+
+def _enough_cells(shape: NDArray[np.bool_], cell: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return solid cells that meet the same voxels as all of them, if cells are small (``_voxels_of``).
+
+    They are the cells with a neighbour that is not solid, and of the inner ones those on a lattice of half a
+    voxel. A voxel that meets an inner cell, but none with such a neighbour, holds solid cells alone (it is
+    convex and several cells wide), hence a point of the lattice, which no ball as wide as a voxel misses.
+    """
+    core = shape
+    for axis in range(3):
+        low, middle, high = (
+            core[(slice(None),) * axis + (part,)] for part in (slice(None, -2), slice(1, -1), slice(2, None))
+        )
+        core = low & middle & high
+    chosen = shape.copy()
+    chosen[1:-1, 1:-1, 1:-1] &= ~core
+    steps = np.clip(0.5 / np.maximum(cell, 1e-9), 1, len(shape)).astype(np.int64)
+    lattice = tuple(slice(int(step) // 2, None, int(step)) for step in steps)
+    chosen[lattice] = shape[lattice]
+    return chosen
