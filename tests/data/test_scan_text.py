@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from raytran.data.scan_text import check_intrinsics, is_rigid, read_header, read_intrinsics, read_matrix
+from raytran.data.scan_text import are_rigid, check_intrinsics, read_header, read_intrinsics, read_matrix
 from raytran.errors import DataError
 
 from .scan_forms import INTRINSICS, look_along_x
@@ -40,12 +40,11 @@ def test_no_file_is_no_matrix(tmp_path) -> None:
 
 def test_rigid_motions() -> None:
     pose = look_along_x(2.0)
-    assert is_rigid(pose)
-    lost, mirrored = np.full((4, 4), -np.inf), pose * np.array([-1, 1, 1, 1])
-    for spoiled in (lost, np.zeros((4, 4)), mirrored, pose * 1.1):
-        assert not is_rigid(spoiled)
-    pose[0, 3] = np.nan
-    assert not is_rigid(pose)
+    lost, mirrored, nan = np.full((4, 4), -np.inf), pose * np.array([-1, 1, 1, 1]), pose.copy()
+    nan[0, 3] = np.nan
+    poses = np.stack([pose, lost, np.zeros((4, 4)), mirrored, pose * 1.1, nan, np.eye(4)])
+    assert are_rigid(poses).tolist() == [True, False, False, False, False, False, True]
+    assert are_rigid(poses[:0]).tolist() == []
 
 
 def test_header_lines_may_hold_anything(tmp_path) -> None:

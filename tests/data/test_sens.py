@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import struct
 import tracemalloc
@@ -168,6 +169,22 @@ def test_damaged_blobs_name_the_frame(write, frames) -> None:
         for index in (1, 2):
             with pytest.raises(DataError, match=rf"depth of frame {index} of .*\.sens is not 8x6"):
                 file.read_depth(index)
+
+
+@pytest.mark.parametrize("value", [0x00, 0xFF])
+def test_any_changed_byte_gives_frames_or_one_sentence(write, value) -> None:
+    """Every byte of the header, every 16th of its matrices, and the first frame's header and image."""
+    path = write("png")
+    whole = path.read_bytes()
+    matrices, first = 12 + len("StructureSensor"), whole.index(struct.pack("<f", 1000.0)) + 12
+    for offset in (*range(matrices), *range(matrices, first, 16), *range(first - 44, first + 120)):
+        path.write_bytes(whole[:offset] + bytes([value]) + whole[offset + 1 :])
+        with contextlib.suppress(DataError), SensFile(path) as file:
+            for index in range(min(len(file), 3)):
+                with contextlib.suppress(DataError):
+                    assert file.read_color(index).shape == (*file.color_size, 3)
+                with contextlib.suppress(DataError):
+                    file.read_depth(index)
 
 
 def peak_of(action) -> int:

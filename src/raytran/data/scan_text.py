@@ -27,12 +27,12 @@ def read_matrix(path: Path) -> NDArray[np.float64] | None:
         return None
 
 
-def is_rigid(pose: NDArray[np.float64]) -> bool:
-    """Whether a 4×4 matrix is finite, and its rotation is one."""
-    turn = pose[:3, :3]
-    return bool(
-        np.isfinite(pose).all() and np.abs(turn @ turn.T - np.eye(3)).max() < 0.01 and np.linalg.det(turn) > 0
-    )
+def are_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return for each of ``(n, 4, 4)`` matrices whether it is finite, and its rotation is one."""
+    finite = np.isfinite(poses).all(axis=(1, 2))
+    turn = np.where(finite[:, None, None], poses[:, :3, :3], 0.0)
+    error = np.abs(turn @ turn.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
+    return finite & (error < 0.01) & (np.linalg.det(turn) > 0)
 
 
 def read_header(path: Path) -> dict[str, str]:

@@ -17,9 +17,9 @@ from raytran.data.images import MIN_VIEWS, read_frames, stored_size
 from raytran.data.scan import OpenScan, Scan, SensScan
 from raytran.data.scan_layout import Layout, Listing, find_layout, recognise
 from raytran.data.scan_text import (
+    are_rigid,
     axis_alignment,
     check_intrinsics,
-    is_rigid,
     read_header,
     read_intrinsics,
     read_matrix,
@@ -37,6 +37,8 @@ NO_IMAGE = "no image"
 NO_POSE = "no pose"
 CUT = "the file ends within this frame"
 """Reasons for which a frame is dropped."""
+
+_NO_MATRIX = np.full((4, 4), np.nan)
 
 
 def read_scan(folder: Path, *, header: Path | None = None) -> Scan:
@@ -71,9 +73,11 @@ def read_sens(path: Path, *, scene_id: str | None = None, header: Path | None = 
     try:
         scene_id = scene_id or path.stem
         poses = file.world_from_camera
-        dropped = {str(i): NO_IMAGE for i in np.flatnonzero(file.num_color_bytes == 0).tolist()}
-        dropped |= {str(i): LOST for i, pose in enumerate(poses) if not is_rigid(pose)}
-        usable = [i for i in range(len(file)) if str(i) not in dropped]
+        rigid, has_image = are_rigid(poses), file.num_color_bytes > 0
+        usable = np.flatnonzero(rigid & has_image).tolist()
+        dropped = {
+            str(i): LOST if has_image[i] else NO_IMAGE for i in np.flatnonzero(~(rigid & has_image)).tolist()
+        }
         if file.damage is not None:
             _log.warning("%s", file.damage)
             dropped[str(len(file))] = CUT
@@ -176,36 +180,35 @@ def scan_views(
 def _read_layout(layout: Layout, header: Path | None) -> Scan:
     folder = layout.scan
     images, pose_files = layout.images(), layout.poses()
-    poses: dict[str, NDArray[np.float64]] = {}
-    dropped: dict[str, str] = {}
-    for name in sorted(images.keys() | pose_files.keys(), key=_numbers_first):
-        if name not in images or name not in pose_files:
-            dropped[name] = NO_IMAGE if name not in images else NO_POSE
-        elif (pose := read_matrix(pose_files[name])) is None or not is_rigid(pose):
-            dropped[name] = LOST
-        else:
-            poses[name] = pose
-    if not poses:
+    both = sorted(images.keys() & pose_files.keys(), key=_numbers_first)
+    dropped = {name: NO_IMAGE for name in pose_files.keys() - images.keys()}
+    dropped |= {name: NO_POSE for name in images.keys() - pose_files.keys()}
+    matrices = [read_matrix(pose_files[name]) for name in both]
+    poses = np.array([_NO_MATRIX if matrix is None else matrix for matrix in matrices]).reshape(-1, 4, 4)
+    rigid = are_rigid(poses)
+    dropped |= {name: LOST for name, good in zip(both, rigid, strict=True) if not good}
+    names = [name for name, good in zip(both, rigid, strict=True) if good]
+    if not names:
         raise DataError(
             f"none of the {len(dropped)} frames in {folder} has an image and a valid pose: check that each "
             "image has a text file of its name with a finite 4x4 camera-to-world matrix"
         )
     header = header or folder / f"{folder.name}.txt"
     facts = read_header(header)
-    image_size = stored_size([images[name] for name in poses])
+    image_size = stored_size([images[name] for name in names])
     intrinsics = layout.intrinsics()
     return Scan(
         scene_id=folder.name,
         folder=folder,
-        frame_id=tuple(poses),
-        image_path=tuple(images[name] for name in poses),
-        world_from_camera=torch.from_numpy(np.stack(list(poses.values()))),
+        frame_id=tuple(names),
+        image_path=tuple(images[name] for name in names),
+        world_from_camera=torch.from_numpy(poses[rigid]),
         intrinsics=check_intrinsics(
             read_intrinsics(intrinsics), intrinsics, image_size=image_size, header=facts
         ),
         image_size=image_size,
         axis_alignment=axis_alignment(facts, header),
-        dropped=dropped,
+        dropped={name: dropped[name] for name in sorted(dropped, key=_numbers_first)},
     )
 
 
@@ -216,4 +219,4 @@ def _as_tensor(image: NDArray[np.uint8]) -> Tensor:
 def _numbers_first(name: str) -> list[tuple[int, int, str]]:
     """Key that sorts frame names by the numbers in them: 9 before 10, frame-9 before frame-10."""
     parts = re.findall(r"\d+|\D+", name)
-    return [(0, int(part), "") if part.isdigit() else (1, 0, part) for part in parts]
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]

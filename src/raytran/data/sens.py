@@ -265,4 +265,6 @@ class SensFile:
             poses += pose
             blobs += struct.pack("=3Q", start, num_color, num_depth)
         table = np.frombuffer(blobs, "=u8").reshape(-1, 3)
-        return np.frombuffer(poses, "<f4").reshape(-1, 4, 4).astype(np.float64), table
+        # In a damaged file a pose may be a signalling NaN, which the conversion would warn of.
+        with np.errstate(invalid="ignore"):
+            return np.frombuffer(poses, "<f4").reshape(-1, 4, 4).astype(np.float64), table
