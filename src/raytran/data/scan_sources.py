@@ -45,15 +45,19 @@ class ScanSource:
     path: Path
     header: Path | None = None
 
-    def open(self) -> OpenScan:
+    def open(self, *, any_size: bool = False) -> OpenScan:
         """Read the cameras; images are read frame by frame.
+
+        Args:
+            any_size: whether intrinsics may be for another image size; see ``read_scan``.
 
         Raises:
             DataError: the scan is damaged or incomplete; see ``read_scan`` and ``read_sens``.
         """
         if self.form == "sens":
-            return read_sens(self.path, scene_id=self.scene_id, header=self.header)
-        return replace(read_scan(self.path, header=self.header), scene_id=self.scene_id)
+            return read_sens(self.path, scene_id=self.scene_id, header=self.header, any_size=any_size)
+        scan = read_scan(self.path, header=self.header, any_size=any_size)
+        return replace(scan, scene_id=self.scene_id)
 
     @property
     def num_frames(self) -> int:

@@ -80,7 +80,12 @@ def read_intrinsics(path: Path) -> NDArray[np.float64]:
 
 
 def check_intrinsics(
-    matrix: NDArray[np.float64], path: Path, *, image_size: tuple[int, int], header: dict[str, str]
+    matrix: NDArray[np.float64],
+    path: Path,
+    *,
+    image_size: tuple[int, int],
+    header: dict[str, str],
+    any_size: bool = False,
 ) -> Tensor:
     """Return ``(3, 3)`` float64 intrinsics after checking that they can belong to images of ``image_size``.
 
@@ -89,6 +94,7 @@ def check_intrinsics(
         path: where it was read, for errors.
         image_size: ``(H, W)`` of the stored images.
         header: lines of ``<scan>.txt``; its ``colorWidth`` and ``colorHeight`` are what else they may be for.
+        any_size: accept those for another image size, which the data doctor then names.
 
     Raises:
         DataError: they are not finite, not positive, or for another image size.
@@ -98,6 +104,8 @@ def check_intrinsics(
             f"{path} does not hold a camera matrix with positive focal lengths: "
             "write fx, fy, cx, cy of the stored colour images there as 4x4"
         )
+    if any_size:
+        return torch.from_numpy(matrix[:3, :3].copy())
     height, width = image_size
     off = _distance_from_centre(matrix, width, height)
     try:

@@ -41,7 +41,7 @@ CUT = "the file ends within this frame"
 _NO_MATRIX = np.full((4, 4), np.nan)
 
 
-def read_scan(folder: Path, *, header: Path | None = None) -> Scan:
+def read_scan(folder: Path, *, header: Path | None = None, any_size: bool = False) -> Scan:
     """Read a scan's cameras and the list of its frames; images are read later.
 
     A frame without an image or with a pose that is no rigid motion (ScanNet writes ``-inf`` where tracking
@@ -50,21 +50,25 @@ def read_scan(folder: Path, *, header: Path | None = None) -> Scan:
     Args:
         folder: a scan in one of the exported forms of ``scan_layout.FORMS``.
         header: its ``<scan>.txt``; if None the one in the folder, which may be missing.
+        any_size: whether intrinsics may be for another image size; the data doctor wants them as they are.
 
     Raises:
         DataError: the folder or a part of it is missing, no pose is valid, or the intrinsics are for another
             image size.
     """
-    return _read_layout(find_layout(Path(folder)), header)
+    return _read_layout(find_layout(Path(folder)), header, any_size)
 
 
-def read_sens(path: Path, *, scene_id: str | None = None, header: Path | None = None) -> SensScan:
+def read_sens(
+    path: Path, *, scene_id: str | None = None, header: Path | None = None, any_size: bool = False
+) -> SensScan:
     """Open a ``.sens`` recording; frames are dropped as in ``read_scan``.
 
     Args:
         path: the file.
         scene_id: name of the scan; if None the file's without its ending.
         header: its ``<scan>.txt``; if None the one beside the file, which may be missing.
+        any_size: see ``read_scan``.
 
     Raises:
         DataError: see ``SensFile``; no pose is valid, or the intrinsics are for another image size.
@@ -92,7 +96,7 @@ def read_sens(path: Path, *, scene_id: str | None = None, header: Path | None = 
             frame_id=tuple(map(str, usable)),
             world_from_camera=torch.from_numpy(poses[usable]),
             intrinsics=check_intrinsics(
-                file.color_intrinsics, path, image_size=file.color_size, header=facts
+                file.color_intrinsics, path, image_size=file.color_size, header=facts, any_size=any_size
             ),
             image_size=file.color_size,
             axis_alignment=axis_alignment(facts, header),
@@ -177,7 +181,7 @@ def scan_views(
     return Views(images[None], cameras.intrinsics.float()[None], pose.float()[None]), used
 
 
-def _read_layout(layout: Layout, header: Path | None) -> Scan:
+def _read_layout(layout: Layout, header: Path | None, any_size: bool) -> Scan:
     folder = layout.scan
     images, pose_files = layout.images(), layout.poses()
     both = sorted(images.keys() & pose_files.keys(), key=_numbers_first)
@@ -204,7 +208,7 @@ def _read_layout(layout: Layout, header: Path | None) -> Scan:
         image_path=tuple(images[name] for name in names),
         world_from_camera=torch.from_numpy(poses[rigid]),
         intrinsics=check_intrinsics(
-            read_intrinsics(intrinsics), intrinsics, image_size=image_size, header=facts
+            read_intrinsics(intrinsics), intrinsics, image_size=image_size, header=facts, any_size=any_size
         ),
         image_size=image_size,
         axis_alignment=axis_alignment(facts, header),
