@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
 from scipy.ndimage import binary_dilation, gaussian_filter
 from scipy.spatial.transform import Rotation
@@ -20,6 +21,7 @@ from raytran.data.scannet import read_scan
 from raytran.data.shapenet import read_mesh
 from raytran.data.shapenet_binvox import read_binvox
 from raytran.data.targets import foreground_masks, scene_occupancy, shape_grids
+from raytran.data.voxelize import voxelize_solid
 from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
@@ -183,6 +185,36 @@ class TestShapes:
         changed = shape_grids(("03001627/cube",), **options)
         assert not changed.all()
         assert changed.any()
+
+    def test_known_and_new_models_together(self, write_cube, tmp_path, monkeypatch) -> None:
+        path = write_cube(model_id="corner")
+        path.write_text(path.read_text().replace("v 0.5 0.5 0.5", "v 0.9 0.9 0.9"))
+        write_cube()
+        options = {"shapenet_root": tmp_path / "shapenet", "cache": MaskCache(folder=tmp_path / "cache")}
+        (corner,) = shape_grids(("03001627/corner",), **options)
+        made = []
+        monkeypatch.setattr(
+            targets, "voxelize_solid", lambda *mesh, size: made.append(1) or voxelize_solid(*mesh, size=size)
+        )
+        names = ("03001627/cube", "03001627/corner", "03001627/cube")
+        shapes = shape_grids(names, **options)
+        assert made == [1]
+        assert torch.equal(shapes[1], corner)
+        assert shapes[[0, 2]].all()
+        assert torch.equal(shape_grids(names, **options), shapes)
+        assert made == [1]
+
+    def test_a_model_of_the_first_release(self, tmp_path) -> None:
+        # A stair whose low step is in front: +X in v1, hence low z in a grid.
+        folder = tmp_path / "ShapeNetCore.v1" / "03001627" / "stair"
+        folder.mkdir(parents=True)
+        high = trimesh.creation.box(bounds=[(-0.5, 0, -0.3), (0, 0.4, 0.3)])
+        low = trimesh.creation.box(bounds=[(0, 0, -0.3), (0.5, 0.1, 0.3)])
+        (folder / "model.obj").write_text(trimesh.util.concatenate([high, low]).export(file_type="obj"))
+        (grid,) = shape_grids(("03001627/stair",), shapenet_root=tmp_path, cache=MaskCache(folder=tmp_path))
+        assert not grid[:, 17:, :31].any()
+        assert grid[:, :, 32:].all()
+        assert grid[:, :15].all()
 
     def test_missing_model(self, tmp_path) -> None:
         cache = MaskCache(folder=tmp_path / "cache")

@@ -4,7 +4,8 @@
 In v2 the front of a model is -Z, the diagonal of its box is 1 and the origin is its mean vertex. In v1 the
 front is +X and the model lies in a unit cube around the origin: it is turned by +90° about +Y and
 normalised as in v2. The two releases were converted from the source files by different programs, so the
-mean vertices of one model can differ a little; its box does not.
+mean vertices of one model can differ a little; its box does not. A few models of v1 are mirrored left to
+right, which the box alone cannot tell: use v2, for which Scan2CAD was annotated, if you have the choice.
 """
 
 from __future__ import annotations
@@ -78,6 +79,12 @@ def shapenet_version(root: Path) -> Version:
 def has_model(root: Path, catid: str, model_id: str) -> bool:
     """Tell whether the mesh file of a model is there; it is not opened."""
     return _find_mesh(root, catid, model_id) is not None
+
+
+def model_names(root: Path, catid: str) -> list[str]:
+    """Return the names of all models of a category whose mesh file is there, of either release, sorted."""
+    folders = {folder.name for nest in _NESTS for folder in (root / nest / catid).glob("*/")}
+    return sorted(name for name in folders if has_model(root, catid, name))
 
 
 def mesh_path(root: Path, catid: str, model_id: str) -> Path:

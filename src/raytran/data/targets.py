@@ -37,15 +37,15 @@ def shape_grids(model_ids: tuple[str, ...], *, shapenet_root: Path, cache: MaskC
     Raises:
         DataError: a CAD file is missing or cannot be read.
     """
-    grids = np.zeros((len(model_ids), SHAPE_SIZE, SHAPE_SIZE, SHAPE_SIZE), dtype=bool)
-    for grid, model_id in zip(grids, model_ids, strict=True):
-        content = _content(shapenet_root, model_id)
-        key = digest(_VERSION, SHAPE_SIZE, content)
-        stored = cache.read("shape", key, grid.shape)
-        if stored is None:
-            stored = voxelize_solid(*_unit_mesh(shapenet_root, model_id, content), size=SHAPE_SIZE)
-            cache.write("shape", key, stored)
-        grid[:] = stored
+    contents = [_content(shapenet_root, model_id) for model_id in model_ids]
+    keys = [digest(_VERSION, SHAPE_SIZE, content) for content in contents]
+    grids, missing = cache.read_stack("shape", keys, (SHAPE_SIZE,) * 3)
+    for i in missing:
+        if (first := keys.index(keys[i])) < i:
+            grids[i] = grids[first]
+        else:
+            grids[i] = voxelize_solid(*_unit_mesh(shapenet_root, model_ids[i], contents[i]), size=SHAPE_SIZE)
+            cache.write("shape", keys[i], grids[i])
     return torch.from_numpy(grids)
 
 
