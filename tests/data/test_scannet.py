@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import zlib
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from PIL import Image
 
 from raytran.data.scannet import load_views, open_scan, read_scan, read_sens
 from raytran.errors import DataError
+
+from .scan_forms import encode_sens
 
 
 def test_frames_are_in_the_order_of_their_numbers(write_scan) -> None:
@@ -195,6 +198,13 @@ def test_exported_frames_go_before_a_recording_of_the_same_folder(write_sens, wr
         open_scan(path.parent / "nowhere")
 
 
+def test_a_folder_of_recordings_is_no_scan(write_sens) -> None:
+    path = write_sens()
+    path.with_name("scene0001_00.sens").write_bytes(path.read_bytes())
+    with pytest.raises(DataError, match=r"scene0000_00 holds 2 recordings: give the path of one of them"):
+        open_scan(path.parent)
+
+
 def test_a_header_may_lie_elsewhere_and_state_no_size(write_scan, tmp_path) -> None:
     header = tmp_path / "elsewhere.txt"
     header.write_text("colorWidth = 0\ncolorHeight = 0\naxisAlignment = 1 0 0 2 0 1 0 0 0 0 1 0 0 0 0 1\n")
@@ -202,23 +212,6 @@ def test_a_header_may_lie_elsewhere_and_state_no_size(write_scan, tmp_path) -> N
     header.write_text("axisAlignment = one\n")
     with pytest.raises(DataError, match=r"axisAlignment in .*elsewhere\.txt"):
         read_scan(write_scan("scene0001_00"), header=header)
-
-
-def test_damaged_images_are_named_when_they_are_read(write_scan) -> None:
-    folder = write_scan(frames=(0, 10, 20))
-    scan = read_scan(folder)
-    (folder / "color" / "0.jpg").write_bytes(b"no image")
-    Image.new("RGB", (8, 8)).save(folder / "color" / "10.jpg")
-    (folder / "color" / "20.jpg").unlink()
-    for index, reason in (
-        (0, "cannot read the image"),
-        (1, r"10\.jpg is 8x8, not 48x32"),
-        (2, "cannot read"),
-    ):
-        with pytest.raises(DataError, match=reason):
-            scan.read_color(index)
-    with pytest.raises(DataError, match=r"cannot read the image .*20\.jpg \(No such file"):
-        scan.color_bytes(2)
 
 
 def test_real_scan_with_lost_frames(shared_dir) -> None:
@@ -233,6 +226,32 @@ def test_real_scan_with_lost_frames(shared_dir) -> None:
     assert angle.item() == pytest.approx(-4.3, abs=0.05)
     expected = np.loadtxt(folder / "pose" / "10.txt")
     np.testing.assert_array_equal(scan.world_from_camera[1].numpy(), expected)
+
+
+def test_real_scan_packed_as_a_recording(shared_dir, tmp_path) -> None:
+    """Images, depth maps and lost poses of a real scan, as its recording would hold them."""
+    folder = shared_dir / "realdata" / "scene0470_00" / "scannet" / "scans" / "scene0470_00"
+    scan = read_scan(folder)
+    names = sorted((path.stem for path in (folder / "pose").iterdir()), key=int)
+    color = [(folder / "color" / f"{name}.jpg").read_bytes() for name in names]
+    maps = [np.array(Image.open(folder / "depth" / f"{name}.png"), np.uint16) for name in names[:3]]
+    depth = [zlib.compress(values.tobytes()) for values in maps] + [b""] * (len(names) - 3)
+    poses = np.stack([np.loadtxt(folder / "pose" / f"{name}.txt") for name in names])
+    path = tmp_path / "scene0470_00.sens"
+    sizes = {"color_size": (480, 640), "depth_size": maps[0].shape}
+    matrix = np.loadtxt(folder / "intrinsic" / "intrinsic_color.txt")
+    path.write_bytes(encode_sens(color, depth, poses, intrinsics=matrix, **sizes))
+    with read_sens(path, header=folder / "scene0470_00.txt") as recording:
+        assert [names[int(name)] for name in recording.frame_id] == list(scan.frame_id)
+        assert {names[int(name)]: reason for name, reason in recording.dropped.items()} == scan.dropped
+        torch.testing.assert_close(recording.world_from_camera, scan.world_from_camera, rtol=0, atol=4e-7)
+        assert torch.equal(recording.axis_alignment, scan.axis_alignment)
+        torch.testing.assert_close(recording.intrinsics, scan.intrinsics, rtol=1e-7, atol=0)
+        for index in (0, 7, 59):
+            assert recording.color_bytes(index) == scan.color_bytes(index)
+            np.testing.assert_array_equal(recording.read_color(index), scan.read_color(index))
+        for index, values in enumerate(maps):
+            np.testing.assert_array_equal(recording.file.read_depth(index), values)
 
 
 def test_real_walk_is_resized_to_another_aspect(shared_dir) -> None:

@@ -144,6 +144,13 @@ def test_occipital_depth_is_refused_but_colour_is_read(write, frames) -> None:
             file.read_depth(0)
 
 
+def test_depth_without_a_unit_is_refused(write) -> None:
+    path = write()
+    path.write_bytes(path.read_bytes().replace(struct.pack("<f", 1000.0), struct.pack("<f", 0.0), 1))
+    with SensFile(path) as file, pytest.raises(DataError, match=r"states 0\.0 depth units in a metre"):
+        file.read_depth(0)
+
+
 def test_frames_without_depth_or_colour(write, frames) -> None:
     blob = encode_color(frames[0][0], "png")
     with SensFile(write("png", color_blobs=[blob, b"", blob], depth_blobs=[b"", b"", b""])) as file:

@@ -122,7 +122,9 @@ def open_scan(path: Path) -> OpenScan:
     if path.is_dir():
         listing = Listing.of(path)
         recordings = sorted(name for name in listing.files if name.endswith(".sens"))
-        if len(recordings) == 1 and recognise(listing) is None:
+        if recordings and recognise(listing) is None:
+            if len(recordings) > 1:
+                raise DataError(f"{path} holds {len(recordings)} recordings: give the path of one of them")
             return read_sens(path / recordings[0])
     return read_scan(path)
 

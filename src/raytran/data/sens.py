@@ -158,9 +158,15 @@ class SensFile:
                 f"the depth in {self.path} is packed with Occipital's closed codec: export the scan with "
                 "ScanNet's own tool, or do without depth"
             )
+        if not 0 < self.depth_shift < np.inf:
+            raise DataError(f"{self.path} states {self.depth_shift} depth units in a metre: copy it again")
         blob = self._blob(index, "depth", start + num_color, num_depth, height * width)
         try:
-            pixels = zlib.decompressobj().decompress(blob, wanted + 1) if self._zlib else blob
+            pixels = (
+                zlib.decompressobj().decompress(blob, wanted + 1)
+                if self.depth_compression == "zlib"
+                else blob
+            )
         except zlib.error as error:
             raise DataError(
                 f"the depth of frame {index} of {self.path} is damaged ({error}): copy it again"
@@ -170,10 +176,6 @@ class SensFile:
                 f"the depth of frame {index} of {self.path} is not {width}x{height}: copy the file again"
             )
         return np.frombuffer(pixels, "<u2").astype(np.uint16, copy=False).reshape(height, width)
-
-    @property
-    def _zlib(self) -> bool:
-        return self.depth_compression == "zlib"
 
     def _color_blob(self, index: int) -> bytes:
         start, num_bytes = (int(value) for value in self._index[1][index][:2])
