@@ -260,6 +260,14 @@ def test_a_scan_without_readable_images_is_named_and_the_others_go_on(released, 
     assert prepare(released, tmp_path / "out").report["scans"]["prepared"] == 3
 
 
+def test_without_a_single_usable_scan_the_command_fails(released, prepare, tmp_path):
+    for path in released.rglob("intrinsic_color.txt"):
+        path.unlink()
+    with pytest.raises(DataError, match=r"no scan could be prepared \(.*intrinsic_color.txt is missing"):
+        prepare(released, tmp_path / "out")
+    assert "3 scans that cannot be read" in (tmp_path / "out" / "report.txt").read_text()
+
+
 def test_a_scan_in_two_places_is_taken_once(released, prepare, tmp_path):
     shutil.copytree(released / SCAN, released / "scannet/more/scene0000_00")
     shutil.rmtree(released / SCAN / "pose")

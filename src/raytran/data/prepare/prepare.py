@@ -17,6 +17,7 @@ from raytran.data.prepare.settings import PrepareSettings, claimed
 from raytran.data.prepare.sources import Released, read_sources
 from raytran.data.prepare.steps import Preparation
 from raytran.data.workers import work_on
+from raytran.errors import DataError
 
 _log = logging.getLogger(__name__)
 
@@ -71,7 +72,8 @@ def prepare_scan2cad(
 
     Raises:
         ConfigError: the arguments contradict each other.
-        DataError: an input is missing, ``output`` was begun otherwise, or its disk is full.
+        DataError: an input is missing, ``output`` was begun otherwise, its disk is full, or no scan can be
+            used.
     """
     output, settings = Path(output).resolve(), settings or PrepareSettings()
     sources = read_sources(released, output)
@@ -88,4 +90,12 @@ def prepare_scan2cad(
     except OSError as error:
         check_room(error, output)
         raise
+    if not report["scans"]["prepared"]:
+        raise _nothing_prepared(output, report)
     return Prepared(output, report, report_text(report))
+
+
+def _nothing_prepared(output: Path, report: dict[str, Any]) -> DataError:
+    failed = report["left_out"]["scans_failed"]
+    why = next(iter(failed.values()), "none of their objects can be used")
+    return DataError(f"no scan could be prepared ({why}); {output / 'report.txt'} names what was left out")
