@@ -172,9 +172,9 @@ def test_a_cut_recording_gives_the_frames_before_and_says_so(write_sens, caplog)
     path.write_bytes(path.read_bytes()[: -2 * 128 - 8 - 10])
     with caplog.at_level(logging.WARNING), read_sens(path) as scan:
         assert scan.frame_id == ("0", "2", "3")
-        assert scan.dropped["4"] == "the file ends within this frame"
+        assert scan.dropped["4"] == "the file ends here"
         assert scan.damage == caplog.messages[0]
-        assert "ends within frame 4 of the 5 that its header promises" in scan.damage
+        assert "ends after 4 of the 5 frames that its header promises" in scan.damage
 
 
 def test_recordings_without_a_usable_frame(write_sens) -> None:

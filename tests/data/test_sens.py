@@ -104,7 +104,7 @@ def test_cut_file_gives_the_frames_before(write, frames, missing) -> None:
     left = 1 if missing == 900 else 2
     with SensFile(path) as file:
         assert len(file) == left
-        assert f"ends within frame {left} of the 3 that its header promises" in (file.damage or "")
+        assert f"ends after {left} of the 3 frames that its header promises" in (file.damage or "")
         assert "scene0000_00.sens" in (file.damage or "")
         np.testing.assert_array_equal(file.read_color(left - 1), frames[0][left - 1])
 
@@ -212,7 +212,7 @@ def test_absurd_counts_cost_nothing(write) -> None:
         with SensFile(path) as file:
             assert len(file) == 3
             assert file.num_frames_at_most < 1000
-            assert "of the 1152921504606846976 that its header promises" in (file.damage or "")
+            assert "of the 1152921504606846976 frames that its header promises" in (file.damage or "")
         path.write_bytes(whole[:4] + struct.pack("<Q", 2**60) + whole[12:])
         with pytest.raises(DataError, match=r"is no \.sens"):
             SensFile(path)
@@ -221,7 +221,7 @@ def test_absurd_counts_cost_nothing(write) -> None:
             path.write_bytes(whole[: first + 80] + claim + whole[first + 96 :])
             with SensFile(path) as file:
                 assert len(file) == 0
-                assert "ends within frame 0" in (file.damage or "")
+                assert "ends after 0" in (file.damage or "")
 
     assert peak_of(read_all) < 1_000_000
 

@@ -35,7 +35,7 @@ _log = logging.getLogger(__name__)
 LOST = "pose is not finite or no rigid motion"
 NO_IMAGE = "no image"
 NO_POSE = "no pose"
-CUT = "the file ends within this frame"
+CUT = "the file ends here"
 """Reasons for which a frame is dropped."""
 
 _NO_MATRIX = np.full((4, 4), np.nan)

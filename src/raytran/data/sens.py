@@ -112,8 +112,8 @@ class SensFile:
         if len(self) == self.num_stated:
             return None
         return (
-            f"{self.path} ends within frame {len(self)} of the {self.num_stated} that its header promises: "
-            "copy it again, or use the frames before"
+            f"{self.path} ends after {len(self)} of the {self.num_stated} frames that its header promises: "
+            "copy it again, or go on with these"
         )
 
     def color_bytes(self, index: int) -> bytes | None:
