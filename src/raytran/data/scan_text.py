@@ -29,7 +29,7 @@ def read_matrix(path: Path) -> NDArray[np.float64] | None:
 
 def are_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return for each of ``(n, 4, 4)`` matrices whether it is finite, and its rotation is one."""
-    finite = np.isfinite(poses).all(axis=(1, 2))
+    finite = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
     turn = np.where(finite[:, None, None], poses[:, :3, :3], 0.0)
     error = np.abs(turn @ turn.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
     return finite & (error < 0.01) & (np.linalg.det(turn) > 0)
