@@ -180,6 +180,13 @@ def test_copies_of_v1_are_models_of_v2(both, tmp_path: Path) -> None:
     np.testing.assert_allclose(translate, low - shift, atol=1e-6)
 
 
+def test_damaged_voxels_do_not_cost_the_mesh(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    put_v1(tmp_path).with_name("model.solid.binvox").write_bytes(b"#binvox 1\n")
+    folder = copy_model(tmp_path, *MODEL, tmp_path / "out")
+    assert {path.name for path in folder.iterdir()} == {"model_normalized.obj", "model_normalized.json"}
+    assert "model.solid.binvox is damaged" in caplog.text
+
+
 def test_a_copy_is_whole_or_absent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     put_v2(tmp_path)
 

@@ -121,6 +121,12 @@ class TestOccupancy:
         objects = replace(box((0.1, 0.1, 0.1), (0.4, 0.0, 0.4)), shape=shape)
         assert scene_occupancy(objects, grid((4, 4, 4), (4.0, 4.0, 4.0))).nonzero().tolist() == [[2, 2, 2]]
 
+    @pytest.mark.parametrize("side", [1e3, 1e9, math.inf, math.nan])
+    def test_an_object_in_another_unit_is_named(self, side) -> None:
+        objects = box((0.0, 0.0, 0.0), (0.5, side, 0.5))
+        with pytest.raises(DataError, match=r"0\.5 × .* × 0\.5 m is too large .*unit"):
+            scene_occupancy(objects, grid((48, 48, 16), (1e-3, 1e-3, 1e-3)))
+
     def test_a_real_scene_agrees_with_the_voxels_of_shapenet(self, shared_dir, tmp_path) -> None:
         """Occupancy of the scene from our shapes and from ShapeNet's own solid voxels."""
         root = shared_dir / "realdata" / "scene0470_00"

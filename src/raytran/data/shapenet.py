@@ -11,6 +11,7 @@ right, which the box alone cannot tell: use v2, for which Scan2CAD was annotated
 from __future__ import annotations
 
 import json
+import logging
 import re
 import shutil
 from dataclasses import dataclass
@@ -26,6 +27,8 @@ from raytran.data.shapenet_binvox import read_binvox, write_binvox
 from raytran.data.shapenet_obj import read_obj, replaced_obj
 from raytran.errors import DataError
 
+_log = logging.getLogger(__name__)
+
 STEM = "model_normalized"
 """Name without ending of every file of a model."""
 
@@ -38,6 +41,11 @@ V2_FROM_V1 = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 _NESTS = (
     *(".", "ShapeNetCore.v2", "ShapeNetCore.v2/ShapeNetCore.v2", "ShapeNetCore"),
     *("ShapeNetCore.v1", "ShapeNetCore.v1/ShapeNetCore.v1"),
+)
+_MESHES: tuple[tuple[str, Version], ...] = (
+    (f"models/{STEM}.obj", "v2"),
+    ("model.obj", "v1"),
+    ("models/model.obj", "v1"),
 )
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*")
 _CATEGORY = "[0-9]" * 8
@@ -197,10 +205,7 @@ def _find_mesh(root: Path, catid: str, model_id: str) -> tuple[Path, Version] | 
 
 
 def _mesh_below(model: Path) -> tuple[Path, Version] | None:
-    for inside, version in ((f"models/{STEM}.obj", "v2"), ("model.obj", "v1"), ("models/model.obj", "v1")):
-        if (model / inside).is_file():
-            return model / inside, "v2" if version == "v2" else "v1"
-    return None
+    return next(((model / name, version) for name, version in _MESHES if (model / name).is_file()), None)
 
 
 def _facts_of_v1(path: Path, vertices: NDArray[np.float64]) -> ModelFacts:
@@ -234,11 +239,18 @@ def _convert_v1(path: Path, vertices: NDArray[np.float64], model_id: str, files:
     (files / f"{STEM}.json").write_text(json.dumps(values), encoding="ascii")
     solid = path.with_name("model.solid.binvox")
     if solid.is_file():
-        cells, translate, scale = read_binvox(solid)
-        # The cube's lower corner after the turn: z runs against the old x.
-        low = np.array([translate[2], translate[1], -translate[0] - scale])
-        diagonal = float(np.linalg.norm(facts.high - facts.low))
-        turned = cells.transpose(2, 1, 0)[:, :, ::-1]
-        write_binvox(
-            files / f"{STEM}.solid.binvox", turned, (low - facts.centroid) / diagonal, scale / diagonal
-        )
+        _turn_voxels(solid, facts, files / f"{STEM}.solid.binvox")
+
+
+def _turn_voxels(path: Path, facts: ModelFacts, output: Path) -> None:
+    """Write the voxels of v1 in the frame of v2; damaged ones are left out, as training needs none."""
+    try:
+        cells, translate, scale = read_binvox(path)
+    except DataError as error:
+        _log.warning("left out: %s", error)
+        return
+    # The cube's lower corner after the turn: z runs against the old x.
+    low = np.array([translate[2], translate[1], -translate[0] - scale])
+    diagonal = float(np.linalg.norm(facts.high - facts.low))
+    turned = cells.transpose(2, 1, 0)[:, :, ::-1]
+    write_binvox(output, turned, (low - facts.centroid) / diagonal, scale / diagonal)

@@ -14,10 +14,14 @@ from torch import Tensor
 from raytran.data.cache import MaskCache, digest, file_digest
 from raytran.data.shapenet import mesh_path, read_mesh
 from raytran.data.voxelize import voxelize_solid
+from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.ops.rasterize import rasterize_mask
 from raytran.types import SHAPE_SIZE, ObjectSet
+
+_MAX_POINTS = 1 << 24
+"""Most points that fill one object; only boxes far larger than any room have more."""
 
 _VERSION = 1
 """Part of every key; raise it when the way a target is computed changes."""
@@ -61,16 +65,25 @@ def scene_occupancy(objects: ObjectSet, grid: VoxelGrid) -> Tensor:
 
     Returns:
         ``(X, Y, Z)`` bool.
+
+    Raises:
+        DataError: an object is too large for the voxels, as if given in another unit.
     """
     occupied = np.zeros(grid.num_voxels, dtype=bool)
     if objects.shape is not None:
         lower, voxel = grid.lower.double().numpy(), grid.voxel_size.double().numpy()
         for m, shape in enumerate(objects.shape.numpy()):
             size, rotation, center = _box_of(objects, m)
+            cell = size / len(shape) / voxel.min()
+            if not np.ceil(2 * cell).clip(1).prod() * np.count_nonzero(shape) <= _MAX_POINTS:
+                width, height, depth = size.tolist()
+                raise DataError(
+                    f"an object of {width:.4g} × {height:.4g} × {depth:.4g} m is too large for voxels of "
+                    f"{voxel.min():.4g} m: check the unit and the scale of the annotation"
+                )
             # Continuous voxel coordinates of the object's cells: origin + voxel_from_cell @ (i, j, k).
             voxel_from_cell = rotation * (size / len(shape)) / voxel[:, None]
             origin = (center - rotation @ size / 2 - lower) / voxel
-            cell = size / len(shape) / voxel.min()
             occupied[_voxels_of(shape, cell, voxel_from_cell, origin, grid.resolution)] = True
     return torch.from_numpy(occupied.reshape(grid.resolution))
 
