@@ -20,8 +20,8 @@ from raytran.geometry.grid import VoxelGrid
 from raytran.ops.rasterize import rasterize_mask
 from raytran.types import SHAPE_SIZE, ObjectSet
 
-_MAX_POINTS = 1 << 24
-"""Most points that fill one object; only boxes far larger than any room have more."""
+_MAX_POINTS = 1 << 25
+"""Most points that may fill one object's box; with more it is far larger than any room."""
 
 _VERSION = 1
 """Part of every key; raise it when the way a target is computed changes."""
@@ -75,7 +75,7 @@ def scene_occupancy(objects: ObjectSet, grid: VoxelGrid) -> Tensor:
         for m, shape in enumerate(objects.shape.numpy()):
             size, rotation, center = _box_of(objects, m)
             cell = size / len(shape) / voxel.min()
-            if not np.ceil(2 * cell).clip(1).prod() * np.count_nonzero(shape) <= _MAX_POINTS:
+            if not np.ceil(2 * cell).clip(1).prod() * shape.size <= _MAX_POINTS:
                 width, height, depth = size.tolist()
                 raise DataError(
                     f"an object of {width:.4g} × {height:.4g} × {depth:.4g} m is too large for voxels of "
