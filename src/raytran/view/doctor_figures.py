@@ -62,15 +62,13 @@ def sight(examination: Examination, recording: Recording, *, corrected: bool) ->
     return Sight(poses, right, points)
 
 
-def draw_plan(
-    examination: Examination, seen: Sight, extent: tuple[float, float, float], *, title: str
-) -> bytes:
+def draw_plan(examination: Examination, seen: Sight, extent: tuple[float, float, float]) -> bytes:
     """Return a PNG: cameras, view rays, boxes, the volume and up, from above and from the side."""
     figure = Figure(figsize=(11, 4.6), dpi=110, layout="constrained", facecolor="white")
     above, side = figure.subplots(1, 2, width_ratios=[1, 1])
     for axes, across, name in ((above, 1, "from above"), (side, 2, "from the side")):
         _draw_panel(axes, examination, seen, extent, across)
-        axes.set_title(f"{title}, {name}", loc="left", fontsize=10, color=INK)
+        axes.set_title(name, loc="left", fontsize=10, color=INK)
     _draw_up(side, seen)
     return _png(figure)
 
@@ -178,7 +176,10 @@ def _draw_up(axes: Axes, seen: Sight) -> None:
     """Draw where the tops of the images point, in the mean, at the mean camera."""
     poses = seen.world_from_camera
     up, start = -poses[:, :3, 1].mean(axis=0)[[0, 2]], poses[:, :3, 3].mean(axis=0)[[0, 2]]
-    length = 0.25 * float(np.ptp(axes.get_ylim()))
+    low, high = axes.get_ylim()
+    length = 0.3 * (high - low)
+    tip = float(start[1] + 1.25 * length * up[1])
+    axes.set_ylim(min(low, tip), max(high, tip))
     axes.annotate(
         "up",
         xy=tuple(start),
@@ -224,13 +225,19 @@ def _meshes(examination: Examination) -> list[trimesh.Trimesh | None]:
     if annotation is None or root is None or len(annotation.model_id) != count:
         return [None] * count
     meshes: list[trimesh.Trimesh | None] = []
-    for model, pose in zip(annotation.model_id, annotation.scan_from_cad.numpy(), strict=True):
+    objects = examination.objects
+    for i, model in enumerate(objects.model_id):
         try:
             mesh = read_mesh(root, *model.split("/"))
         except DataError:
             meshes.append(None)
             continue
-        placed = mesh.vertices @ pose[:3, :3].T + pose[:3, 3]
+        # By way of the box, so that whatever was found about the boxes holds for the meshes.
+        unit = (mesh.vertices - annotation.box_center[i].numpy()) / (2 * annotation.box_half_size[i].numpy())
+        size, turn, center = (
+            part[i].double().numpy() for part in (objects.size, objects.rotation, objects.center)
+        )
+        placed = (np.nan_to_num(unit, posinf=0.0, neginf=0.0) * size) @ turn.T + center
         meshes.append(trimesh.Trimesh(placed, mesh.faces, process=False))
     return meshes
 

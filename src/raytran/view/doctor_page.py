@@ -141,7 +141,7 @@ def _part(examination: Examination, extent: tuple[float, float, float], title: s
     frames = telling_frames(examination, right, recording.scan.image_size, _FRAMES)
     pictures = draw_frames(examination, recording, seen, frames)
     names = [recording.scan.frame_id[frame] for frame in frames]
-    plan = draw_plan(examination, seen, extent, title=title)
+    plan = draw_plan(examination, seen, extent)
     return _Part(title, plan, list(zip(names, pictures, strict=True)))
 
 

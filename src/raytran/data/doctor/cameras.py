@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import permutations, product
 from typing import get_args
@@ -11,58 +10,21 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from raytran.data.doctor.camera_findings import NAMED_TURNS, camera_findings
 from raytran.data.doctor.finding import Correction, Finding, Storage
 from raytran.data.doctor.matches import Matches, triangulate
 from raytran.data.doctor.recording import Recording
 
-FEWEST_MATCHES = 60
-_CLEARLY_BETTER = 0.15
-"""A reading is better only if this share of all matches more agrees with it…"""
-_TIMES_BETTER = 1.4
-"""… and this many times as many."""
-_POOR = 0.3
-"""Below this share of agreeing matches no reading is right."""
-_FOCAL_FACTORS = np.geomspace(0.4, 2.5, 38)
+_FEWEST_MATCHES = 60
 
-_STORAGE_ADVICE: dict[Storage, tuple[str, str]] = {
-    "inverted": (
-        "inverted poses",
-        "invert each matrix: it is camera-from-world and should be world-from-camera",
-    ),
-    "transposed": ("transposed poses", "transpose each matrix: it was written column by column"),
-    "rotation transposed": (
-        "transposed rotations",
-        "transpose the 3x3 rotation in each matrix and leave its last column as it is",
-    ),
-}
+_CLEARLY_BETTER, _TIMES_BETTER = 0.15, 1.4
+"""Other camera axes must win this share of all matches, and this many times as many as the stored ones."""
 
-_NAMED_TURNS: tuple[tuple[str, str, NDArray[np.float64]], ...] = (
-    (
-        "OpenGL camera axes",
-        "negate the second and third column of each camera-to-world matrix",
-        np.diag([1.0, -1.0, -1.0]),
-    ),
-    (
-        "PyTorch3D camera axes",
-        "negate the first and second column of each camera-to-world matrix",
-        np.diag([-1.0, -1.0, 1.0]),
-    ),
-    (
-        "robot camera axes (x forward, z up)",
-        "replace the first three columns (a, b, c) of each camera-to-world matrix by (-b, -c, a)",
-        np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]),
-    ),
-    (
-        "camera turned by 90°",
-        "the images were turned after the poses were made: turn them back, or the cameras with them",
-        np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
-    ),
-    (
-        "camera turned by 90°",
-        "the images were turned after the poses were made: turn them back, or the cameras with them",
-        np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
-    ),
-)
+_NET_GAIN, _GAINED_PER_LOST = 0.06, 5
+"""Other intrinsics must win this share of all matches, and this many for each that they lose."""
+
+_FACTORS = np.geomspace(0.4, 2.5, 38)
+"""Of the focal length: steps of five per cent, then of one."""
 
 
 @dataclass(frozen=True)
@@ -93,38 +55,48 @@ def read_cameras(recording: Recording, matches: Matches) -> CameraReading:
         recording: the scan.
         matches: points seen twice in it.
     """
-
-    def share(correction: Correction) -> float:
-        intrinsics = recording.intrinsics if correction.intrinsics is None else correction.intrinsics
-        agrees, _ = triangulate(matches, correction.apply(recording.stored), intrinsics)
-        return float(agrees.mean()) if len(matches) else 0.0
-
-    given = Correction()
-    best = given
-    if len(matches) >= FEWEST_MATCHES:
-        candidates = [
-            Correction(storage=storage, camera_turn=turn, intrinsics=intrinsics)
-            for intrinsics in _intrinsics_candidates(recording)
-            for storage, turn in product(get_args(Storage), _axis_turns())
-        ]
-        # The stored reading comes first, then plain ones: among equals the first is taken.
-        best = max(candidates, key=lambda candidate: round(share(candidate), 2))
-        if not _better(share(best), share(given)):
-            best = given
-        best = _with_focal_length(best, recording, share)
-    intrinsics = recording.intrinsics if best.intrinsics is None else best.intrinsics
-    agrees, depth = triangulate(matches, best.apply(recording.stored), intrinsics)
-    findings = _findings(recording, best, len(matches), share(given), share(best))
+    jury = _Jury(recording, matches)
+    if len(matches) < _FEWEST_MATCHES:
+        findings = camera_findings(recording, Correction(), len(matches), None)
+        nobody = np.zeros(len(matches))
+        return CameraReading(Correction(), findings, nobody.astype(bool), nobody)
+    scaled = _scaled_intrinsics(recording)
+    candidates = [
+        Correction(storage=storage, camera_turn=turn, intrinsics=intrinsics)
+        for intrinsics in (None, *scaled)
+        for storage, turn in product(get_args(Storage), _axis_turns())
+    ]
+    # The stored reading comes first, then plain ones: among equals the first is taken.
+    best = max(candidates, key=lambda candidate: round(jury.share(candidate), 2))
+    given = jury.share(Correction())
+    if not (jury.share(best) > given + _CLEARLY_BETTER and jury.share(best) > _TIMES_BETTER * given):
+        best = Correction()
+    best = _with_better_intrinsics(replace(best, intrinsics=None), scaled, jury)
+    agrees, depth = jury.hear(best)
+    findings = camera_findings(recording, best, len(matches), (given, float(agrees.mean())))
     return CameraReading(best, findings, agrees, depth)
 
 
-def _better(new: float, old: float) -> bool:
-    return new > old + _CLEARLY_BETTER and new > _TIMES_BETTER * old
+class _Jury:
+    """The matches, asked which cameras they agree with."""
+
+    def __init__(self, recording: Recording, matches: Matches) -> None:
+        self._recording, self._matches = recording, matches
+
+    def intrinsics(self, correction: Correction) -> NDArray[np.float64]:
+        return self._recording.intrinsics if correction.intrinsics is None else correction.intrinsics
+
+    def hear(self, correction: Correction) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+        poses = correction.apply(self._recording.stored)
+        return triangulate(self._matches, poses, self.intrinsics(correction))
+
+    def share(self, correction: Correction) -> float:
+        return float(self.hear(correction)[0].mean())
 
 
 def _axis_turns() -> list[NDArray[np.float64]]:
     """Return the 24 turns that map axes to axes, named ones first."""
-    named = [np.eye(3), *(turn for *_, turn in _NAMED_TURNS)]
+    named = [np.eye(3), *(turn for *_, turn in NAMED_TURNS)]
     others = []
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3)):
         turn = np.eye(3)[:, order] * signs
@@ -133,106 +105,46 @@ def _axis_turns() -> list[NDArray[np.float64]]:
     return named + others
 
 
-def _intrinsics_candidates(recording: Recording) -> list[NDArray[np.float64] | None]:
-    """Return None for the stored intrinsics, and these scaled from the size whose middle they name.
+def _scaled_intrinsics(recording: Recording) -> list[NDArray[np.float64]]:
+    """Return the intrinsics scaled to the images from the size whose middle they name, if that is another.
 
-    The middle may be off in a true camera: so one factor for both rows, from either side, is tried too.
+    The middle may be off in a true camera: so one factor for both rows, from either side, is tried too; and
+    the middle may be wrong by itself.
     """
     height, width = recording.scan.image_size
     matrix = recording.intrinsics
     wide, high = 2 * matrix[0, 2], 2 * matrix[1, 2]
     off = max(abs(wide / width - 1), abs(high / height - 1))
     if min(wide, high) <= 0 or off < 0.03:
-        return [None]
+        return []
     across, down = width / wide, height / high
     factors = ((across, down), (across, across), (down, down))
-    return [None, *(np.diag([x, y, 1.0]) @ matrix for x, y in factors)]
+    centred = matrix.copy()
+    centred[:2, 2] = width / 2, height / 2
+    return [*(np.diag([x, y, 1.0]) @ matrix for x, y in factors), centred]
 
 
-def _with_focal_length(
-    best: Correction, recording: Recording, share: Callable[[Correction], float]
-) -> Correction:
-    """Return ``best`` with the focal length that agrees clearly better, if there is one."""
-    base = recording.intrinsics if best.intrinsics is None else best.intrinsics
-    swept = [
-        replace(best, intrinsics=base * np.array([[f, 1, 1], [1, f, 1], [1, 1, 1]])) for f in _FOCAL_FACTORS
-    ]
-    candidate = max(swept, key=share)
-    return candidate if _better(share(candidate), share(best)) else best
+def _with_better_intrinsics(best: Correction, scaled: list[NDArray[np.float64]], jury: _Jury) -> Correction:
+    """Return ``best`` with scaled intrinsics or another focal length, whichever is clearly better."""
+    best = _winner(best, [replace(best, intrinsics=matrix) for matrix in scaled], jury)
+    coarse = _winner(best, _focal_lengths(best, _FACTORS, jury), jury)
+    if coarse is best:
+        return best
+    return max(_focal_lengths(coarse, np.linspace(0.95, 1.05, 11), jury), key=jury.share)
 
 
-def _findings(
-    recording: Recording, best: Correction, count: int, given: float, share: float
-) -> tuple[Finding, ...]:
-    if count < FEWEST_MATCHES:
-        text = f"only {count} points were found again in other frames, too few to tell"
-        return tuple(Finding(check, "unknown", text) for check in ("camera axes", "intrinsics"))
-    seen = f"{given:.0%} of {count} points matched between frames agree with the cameras as stored"
-    if share < _POOR:
-        return (
-            Finding(
-                "camera axes",
-                "fault",
-                f"{seen}, and no other reading of them does better than {share:.0%}",
-                "poses do not belong to the images",
-                "check that each pose file belongs to the image of its name and that the poses are accurate",
-                "likely",
-            ),
-            Finding("intrinsics", "unknown", "cannot be told while no reading of the poses agrees"),
-        )
-    turned = best.storage != "as stored" or not np.allclose(best.camera_turn, np.eye(3))
-    with_fix = f"{seen}, {share:.0%} after the change"
-    sure = "certain" if count >= 150 and share > 2 * given else "likely"
-    axes = (
-        Finding("camera axes", "fault", with_fix, *_camera_advice(best), sure)
-        if turned
-        else Finding("camera axes", "ok", seen if best.intrinsics is None else with_fix)
-    )
-    if best.intrinsics is None:
-        return axes, Finding("intrinsics", "ok", _describe(recording.intrinsics))
-    return axes, Finding(
-        "intrinsics", "fault", with_fix, *_intrinsics_advice(recording, best.intrinsics), sure
-    )
+def _focal_lengths(reading: Correction, factors: NDArray, jury: _Jury) -> list[Correction]:
+    focal = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+    matrix = jury.intrinsics(reading)
+    return [replace(reading, intrinsics=matrix * (1 + focal * (factor - 1))) for factor in factors.tolist()]
 
 
-def _camera_advice(best: Correction) -> tuple[str, str]:
-    causes, steps = [], []
-    if best.storage != "as stored":
-        cause, step = _STORAGE_ADVICE[best.storage]
-        causes.append(cause)
-        steps.append(step)
-    if not np.allclose(best.camera_turn, np.eye(3)):
-        known = [(name, advice) for name, advice, turn in _NAMED_TURNS if np.allclose(turn, best.camera_turn)]
-        rows = best.camera_turn.astype(int).tolist()
-        name, advice = (
-            known[0]
-            if known
-            else (
-                "unusual camera axes",
-                f"multiply each camera-to-world rotation from the right by {rows}",
-            )
-        )
-        causes.append(name)
-        steps.append(advice)
-    return " and ".join(causes), ", then ".join(steps)
-
-
-def _intrinsics_advice(recording: Recording, right: NDArray[np.float64]) -> tuple[str, str]:
-    height, width = recording.scan.image_size
-    across, down = recording.intrinsics[0, 2] / right[0, 2], recording.intrinsics[1, 2] / right[1, 2]
-    if max(abs(across - 1), abs(down - 1)) < 0.03:
-        return (
-            "wrong focal length",
-            f"give fx, fy of about {right[0, 0]:.0f}, {right[1, 1]:.0f} instead of "
-            f"{recording.intrinsics[0, 0]:.0f}, {recording.intrinsics[1, 1]:.0f} pixels, or calibrate",
-        )
-    return (
-        "intrinsics for another image size",
-        f"they are for images of about {across * width:.0f}x{down * height:.0f}, not {width}x{height}: "
-        f"multiply their first row by {1 / across:.4f} and their second by {1 / down:.4f}",
-    )
-
-
-def _describe(matrix: NDArray[np.float64]) -> str:
-    focal, center = f"{matrix[0, 0]:.1f}, {matrix[1, 1]:.1f}", f"{matrix[0, 2]:.1f}, {matrix[1, 2]:.1f}"
-    return f"focal lengths {focal} and centre {center} pixels fit"
+def _winner(stands: Correction, challengers: list[Correction], jury: _Jury) -> Correction:
+    """Return the best challenger if it wins many more matches than it loses, else ``stands``."""
+    if not challengers:
+        return stands
+    best = max(challengers, key=jury.share)
+    before, after = jury.hear(stands)[0], jury.hear(best)[0]
+    gained, lost = int((after & ~before).sum()), int((before & ~after).sum())
+    wins = gained - lost > _NET_GAIN * len(before) and gained > _GAINED_PER_LOST * lost
+    return best if wins else stands

@@ -10,11 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from raytran.data.doctor.boxes import check_boxes, turned
+from raytran.data.doctor.camera_findings import NO_READING
 from raytran.data.doctor.cameras import CameraReading, read_cameras
 from raytran.data.doctor.finding import Correction, Finding
 from raytran.data.doctor.matches import Matches, match_frames
 from raytran.data.doctor.models import check_models
-from raytran.data.doctor.placement import check_placement
+from raytran.data.doctor.placement import ASTRAY, check_placement, weigh
 from raytran.data.doctor.recording import Recording
 from raytran.data.doctor.sightings import Sightings, depth_at, sightings_from_depth, sightings_from_matches
 from raytran.data.doctor.world import check_unit, check_up, check_volume, turn_to_z
@@ -95,7 +97,7 @@ def examine(
     started = time.perf_counter()
     result = Examination(source.scene_id, source.path, ())
     try:
-        scan = source.open()
+        scan = source.open(any_size=True)
     except DataError as error:
         result = replace(result, findings=(_unopened(source.path, error),))
     else:
@@ -124,30 +126,51 @@ def _examine(
         reading.depth[reading.agrees], None if measured is None else measured[reading.agrees]
     )
     correction = replace(reading.correction, scale=scale)
-    axis, up = check_up(correction.apply(recording.stored))
-    if axis is not None:
-        turn = np.eye(4)
-        turn[:3, :3] = turn_to_z(axis)
-        correction = replace(correction, world_turn=turn)
     sightings = _sightings(recording, matches, reading, scale, intrinsics)
-    findings = [*_check_files(recording), *reading.findings, unit, up]
-    if len(objects):
-        moved, placed = check_placement(
-            sightings, correction.apply(recording.stored), objects, recording.axis_alignment
-        )
-        correction = replace(correction, world_turn=moved @ correction.world_turn)
-        findings.append(placed)
-    poses = correction.apply(recording.stored)
-    findings.append(check_volume(poses[:, :3, 3], objects.center.double().numpy(), extent))
-    return replace(
+    lost = reading.findings[0].cause == NO_READING
+    result = replace(
         result,
-        findings=tuple(findings),
+        findings=(*_check_files(recording), *reading.findings, *([] if lost else [unit])),
         recording=recording,
         correction=correction,
         sightings=sightings,
         objects=objects,
         matches=len(matches),
     )
+    if lost:
+        return result
+    result = _check_world(result, recording, sightings)
+    poses = result.correction.apply(recording.stored)
+    # Where boxes are known to be wrong it says nothing that they are outside, too.
+    astray = any(finding.cause == ASTRAY for finding in result.findings)
+    objects = ObjectSet.empty() if astray else result.objects
+    volume = check_volume(poses[:, :3, 3], objects.center.double().numpy(), extent)
+    return replace(result, findings=(*result.findings, volume))
+
+
+def _check_world(result: Examination, recording: Recording, sightings: Sightings) -> Examination:
+    """Return the examination with what is known of up and of the annotation's place in the world."""
+    stored, correction, objects = recording.stored, result.correction, result.objects
+    findings: list[Finding] = []
+    if len(objects):
+        objects, findings = check_boxes(objects)
+    axis, up = check_up(correction.apply(stored))
+    if axis is not None:
+        turn = np.eye(4)
+        turn[:3, :3] = turn_to_z(axis)
+        together = weigh(sightings, correction.apply(stored), objects, np.eye(4)).score
+        if together > weigh(sightings, correction.apply(stored), objects, turn).score:
+            objects, findings = turned(objects, turn[:3, :3]), findings[:1]
+            up = replace(up, fix=f"{up.fix}, and the annotation's scan transforms likewise")
+        correction = replace(correction, world_turn=turn)
+    findings.append(up)
+    if len(objects):
+        moved, placed = check_placement(
+            sightings, correction.apply(stored), objects, recording.axis_alignment
+        )
+        correction = replace(correction, world_turn=moved @ correction.world_turn)
+        findings.append(placed)
+    return replace(result, findings=(*result.findings, *findings), correction=correction, objects=objects)
 
 
 def _sightings(
@@ -185,9 +208,7 @@ def _check_files(recording: Recording) -> list[Finding]:
 def _unopened(path: Path, error: DataError) -> Finding:
     """Return the finding about a scan that cannot be opened; mirrored poses are told apart."""
     cause, fix = "cannot be read", ""
-    if "another image size" in str(error):
-        cause = "intrinsics for another image size"
-    elif _mirrored(path):
+    if _mirrored(path):
         cause = "left-handed poses"
         fix = (
             "the rotations have determinant -1, as Unity and some renderers write them: negate the second "

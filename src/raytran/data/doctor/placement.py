@@ -23,6 +23,10 @@ _IDLE = 0.05
 """Weight of rays that meet no box: a reading that moves all boxes out of sight must not win."""
 
 
+ASTRAY = "annotation not where the images show objects"
+"""Cause where no reading puts the boxes right."""
+
+
 @dataclass(frozen=True)
 class Reading:
     """A way to read the files: which world the annotation is in.
@@ -156,14 +160,15 @@ def check_placement(
         text = f"{seen}; after the change {after.inside} and {after.through}"
         sure = "certain" if after.score > 3 * given.score and after.inside > 4 * _FEWEST_RAYS else "likely"
         return reading.right_from_given, Finding(check, "fault", text, reading.cause, reading.fix, sure)
-    if given.inside + given.through < _FEWEST_RAYS and len(sightings) < 40 * _FEWEST_RAYS:
+    meet = given.inside + given.through
+    if meet < _FEWEST_RAYS and len(sightings) < 40 * _FEWEST_RAYS:
         return np.eye(4), Finding(check, "unknown", f"{seen}: too few to tell")
-    if given.score < _POOR:
+    if meet < _FEWEST_RAYS or given.inside < _POOR * meet:
         return np.eye(4), Finding(
             check,
             "fault",
             seen,
-            "annotation not where the images show objects",
+            ASTRAY,
             "check that annotation and poses are of the same scan and world",
             "likely",
         )
