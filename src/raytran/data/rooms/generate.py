@@ -81,7 +81,12 @@ def generate_rooms(
         output: folder that gets ``scannet/``, ``shapenet/``, ``scan2cad/`` and ``rooms.json``.
         num_train: training scans, numbered from 0.
         num_val: held-out scans, numbered after them.
-        seed, frames, image_size, min_objects, max_objects, room_size: as in ``RoomSettings``.
+        seed: of everything.
+        frames: pictures with a valid pose in each scan.
+        image_size: ``(H, W)`` pixels.
+        min_objects: least number of objects in a room.
+        max_objects: greatest number of objects in a room.
+        room_size: ranges of the two sides of the floor, metres.
         cads: folder in ShapeNet's layout to furnish with; None for generated models. Training and held-out
             rooms get different models. What it lacks, such as a class, is generated; ``cads.json`` tells
             which models are used, which are not and why.
