@@ -151,9 +151,9 @@ def epoch(root: Path, cache_dir: Path, workers: int) -> dict[str, float]:
 
 
 def own_mebibytes(process_id: int) -> float:
-    """Return the memory that a process shares with no other."""
-    lines = Path(f"/proc/{process_id}/smaps_rollup").read_text().splitlines()
-    return sum(int(line.split()[1]) for line in lines if line.startswith("Private_")) / 1024
+    """Return the memory of a process without what it maps from files or shares for transfer."""
+    lines = Path(f"/proc/{process_id}/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("RssAnon")) / 1024
 
 
 def open_dataset(root: Path, cache_dir: Path, **options: object) -> SceneDataset:
