@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write a data set to disk."""
+"""Write a data set to disk, or check one."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from raytran.data.cads.furniture import import_furniture
 from raytran.data.prepare import PrepareSettings, Released, prepare_scan2cad
 from raytran.data.rooms.generate import generate_rooms
 from raytran.errors import ConfigError
@@ -35,7 +36,7 @@ def prepare(cfg: DictConfig) -> Any:
     """Run ``python -m raytran.prepare``; see ``conf/prepare.yaml``.
 
     Returns:
-        The report of what was written.
+        The report of what was written, or with ``check`` whether nothing needs mending.
 
     Raises:
         ConfigError: the data set is unknown, or a path is missing.
@@ -51,7 +52,8 @@ def prepare(cfg: DictConfig) -> Any:
 
 
 def _rooms(settings: dict[str, Any], output: Path) -> Any:
-    report = generate_rooms(output, **{name: settings[name] for name in _ROOMS})
+    chosen = {name: settings[name] for name in _ROOMS}
+    report = generate_rooms(output, cads=_path(settings["cads"]), **chosen)
     _log.info("rooms are in %s; train on them with data.root=%s", output.resolve(), output)
     return report
 
@@ -79,9 +81,21 @@ def _scan2cad(settings: dict[str, Any], output: Path) -> Any:
     return prepared
 
 
+def _cads(settings: dict[str, Any], output: Path) -> Any:
+    if settings["source"] is None:
+        raise ConfigError("source= is missing: give the folder of the furniture libraries (*.sh3f)")
+    report = import_furniture(Path(settings["source"]), output, processes=settings["processes"])
+    _log.info("models are in %s; furnish rooms with them: dataset=rooms cads=%s", output.resolve(), output)
+    return report
+
+
 def _path(value: str | None) -> Path | None:
     return None if value is None else Path(value)
 
 
-_DATASETS: dict[str, Callable[[dict[str, Any], Path], Any]] = {"rooms": _rooms, "scan2cad": _scan2cad}
+_DATASETS: dict[str, Callable[[dict[str, Any], Path], Any]] = {
+    "rooms": _rooms,
+    "scan2cad": _scan2cad,
+    "cads": _cads,
+}
 """Name of a data set → what writes it."""
