@@ -144,7 +144,7 @@ def read_frames(
     Raises:
         DataError: fewer than ``min_views`` different images can be read.
     """
-    reader = _Reader(read)
+    reader = _Reader(read, len(chosen))
     good = [position for position in chosen if reader.can_read(position)]
     for position in [position for position in chosen if position in reader.failed]:
         near_to_far = np.argsort(np.abs(np.arange(num_frames) - position), kind="stable").tolist()
@@ -160,25 +160,37 @@ def read_frames(
             f"{min_views} are needed: copy or export them again"
         )
     used = sorted(good)
-    return torch.stack([reader.images[position] for position in used]), used
+    return reader.images_at(used), used
 
 
 class _Reader:
-    """Reads each image of a scan at most once and remembers those that cannot be read."""
+    """Reads each image of a scan at most once, into one tensor, and remembers those that cannot be read."""
 
-    def __init__(self, read: Callable[[int], Tensor]) -> None:
-        self.images: dict[int, Tensor] = {}
+    def __init__(self, read: Callable[[int], Tensor], count: int) -> None:
         self.failed: dict[int, DataError] = {}
-        self._read = read
+        self._read, self._count = read, count
+        self._images = torch.empty(0)
+        self._row: dict[int, int] = {}
 
     def can_read(self, position: int) -> bool:
         """Read the image at ``position``, if that was not tried before, and return whether it is there."""
-        if position not in self.images and position not in self.failed:
+        if position not in self._row and position not in self.failed:
             try:
-                self.images[position] = self._read(position)
+                image = self._read(position)
             except DataError as error:
                 self.failed[position] = error
-        return position in self.images
+                return False
+            if not self._row:
+                self._images = torch.empty(self._count, *image.shape, dtype=image.dtype)
+            self._row[position] = len(self._row)
+            # At once, so that the memory of one image serves them all: fresh memory costs more than the copy.
+            self._images[self._row[position]] = image
+        return position in self._row
+
+    def images_at(self, positions: Sequence[int]) -> Tensor:
+        """Return the images at positions that were read, ``(N, 3, H, W)``."""
+        rows = [self._row[position] for position in positions]
+        return self._images if rows == list(range(self._count)) else self._images[rows]
 
 
 def stored_size(paths: Sequence[Path]) -> tuple[int, int]:
