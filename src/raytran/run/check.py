@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import logging
 from pathlib import Path
 
@@ -39,20 +40,20 @@ def check(cfg: DictConfig) -> bool:
     settings = plain(cfg)
     folder = Path(settings["check"])
     output = Path(settings.get("output") or f"doctor_{folder.resolve().name}.html")
-    most = settings.get("checks") or 10
+    most = settings["checks"]
     if most < 1:
         raise ConfigError(f"checks={most} is too few: give at least 1")
-    extent = tuple(settings["model"]["grid_extent"])
+    across, along, up = (float(length) for length in settings["grid_extent"])
     named = {name: Path(settings[name]) for name in ("scan2cad", "shapenet") if settings.get(name)}
     examinations, found = check_folder(
         folder,
         scenes=settings.get("scenes"),
         most=most,
-        grid_extent=(float(extent[0]), float(extent[1]), float(extent[2])),
+        grid_extent=(across, along, up),
         **named,
     )
     page = output if output.suffix == ".html" else output / "doctor.html"
-    write_doctor_page(page, examinations, checked=folder, num_found=found, grid_extent=extent)
+    write_doctor_page(page, examinations, checked=folder, num_found=found, grid_extent=(across, along, up))
     Console().print(_table(examinations))
     _log.info("%s", summary(examinations, folder, found))
     _log.info("wrote %s", page.resolve())
@@ -74,7 +75,7 @@ def check_folder(
 
     Args:
         folder: one scan, a folder of scans, or a data set with ``scannet``, ``shapenet`` and ``scan2cad``.
-        scenes: names of the scans to examine; None: all.
+        scenes: names or patterns of the scans to examine; None: all.
         most: examine no more than these many.
         grid_extent: of the model's volume, metres.
         scan2cad: annotation file or its folder; None: looked for around ``folder``.
@@ -88,10 +89,10 @@ def check_folder(
     """
     found = find_scans(folder)
     if scenes:
-        missing = [name for name in scenes if name not in found]
+        missing = [pattern for pattern in scenes if not fnmatch.filter(found, pattern)]
         if missing:
             raise DataError(f"{missing[0]} is not among the {len(found)} scans in {folder}: mend scenes=")
-        found = {name: found[name] for name in scenes}
+        found = {name: found[name] for pattern in scenes for name in fnmatch.filter(found, pattern)}
     chosen = np.unique(np.linspace(0, len(found) - 1, min(most, len(found))).round().astype(int))
     sources: list[ScanSource] = [list(found.values())[i][0] for i in chosen.tolist()]
     annotations, shapenet = _annotations(folder, scan2cad), shapenet or _around(folder, "shapenet")
