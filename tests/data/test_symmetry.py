@@ -13,7 +13,7 @@ from raytran.data.symmetry import measure_symmetry
 def test_generated_furniture_is_measured_as_it_was_designed(category):
     for seed, (_, recipe) in enumerate(RECIPES[category]):
         model = finish_model(category, recipe(np.random.default_rng(seed)))
-        assert measure_symmetry(model.vertices, model.faces) == model.symmetry, model.kind
+        assert measure_symmetry(model.vertices, model.faces, model.face_color) == model.symmetry, model.kind
 
 
 def turned(mesh):
@@ -50,6 +50,18 @@ def test_a_part_on_one_side_breaks_it_and_a_knob_does_not():
     with_knob, with_block = (trimesh.util.concatenate([top, part]) for part in (knob, block))
     assert measure_symmetry(with_knob.vertices, with_knob.faces) == 4
     assert measure_symmetry(with_block.vertices, with_block.faces) == 1
+
+
+def test_colours_count_and_small_marks_do_not():
+    mesh = trimesh.creation.box(extents=(1.0, 0.6, 0.05)).subdivide().subdivide().subdivide()
+    color = np.full((len(mesh.faces), 3), 0.8)
+    assert measure_symmetry(mesh.vertices, mesh.faces, color) == 2
+    screen = mesh.face_normals[:, 2] < -0.9
+    assert measure_symmetry(mesh.vertices, mesh.faces, np.where(screen[:, None], 0.1, color)) == 1
+    shade = np.where(screen[:, None], 0.75, color)
+    assert measure_symmetry(mesh.vertices, mesh.faces, shade) == 2
+    color[np.flatnonzero(screen)[0]] = 0.1
+    assert measure_symmetry(mesh.vertices, mesh.faces, color) == 2
 
 
 def test_a_mesh_without_extent_has_none():

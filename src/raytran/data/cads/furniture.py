@@ -188,7 +188,7 @@ def _model_id(library: FurnitureLibrary, piece: Piece, listed: Listed) -> str:
 
 def _cad_model(library: FurnitureLibrary, piece: Piece, listed: Listed, model_id: str) -> CadModel:
     mesh, kind = read_piece(library, piece, listed.turn_deg), KINDS[listed.kind]
-    size = np.ptp(mesh.vertices, axis=0)
+    size, face_color = np.ptp(mesh.vertices, axis=0), mesh.group_color[mesh.face_group]
     return CadModel(
         catid=kind.catid,
         model_id=model_id,
@@ -196,9 +196,9 @@ def _cad_model(library: FurnitureLibrary, piece: Piece, listed: Listed, model_id
         kind=listed.kind,
         vertices=(mesh.vertices - mesh.vertices.mean(axis=0)) / np.linalg.norm(size),
         faces=mesh.faces,
-        face_color=mesh.group_color[mesh.face_group],
+        face_color=face_color,
         face_group=mesh.face_group,
-        symmetry=measure_symmetry(mesh.vertices, mesh.faces),
+        symmetry=measure_symmetry(mesh.vertices, mesh.faces, face_color),
         size_m=size,
         support=kind.support,
     )

@@ -195,12 +195,15 @@ def _model(root: Path, catid: str, model_id: str) -> LibraryModel:
     drawn = draw_size(catid, extent, rng) if size is None else size
     held_out = rng.random() < _HELD_OUT_SHARE
     symmetry = facts.get("symmetry")
+    if symmetry not in (0, 1, 2, 4):
+        group, colors = read_face_colors(path, count)
+        symmetry = measure_symmetry(mesh.vertices, mesh.faces, colors[group])
     return LibraryModel(
         catid=catid,
         model_id=model_id,
         category=CLASS_BY_CATID.get(catid, "other"),
         kind=kind,
-        symmetry=symmetry if symmetry in (0, 1, 2, 4) else measure_symmetry(mesh.vertices, mesh.faces),
+        symmetry=symmetry,
         # One factor takes the normalised model to its real size: its diagonal in metres.
         size_m=tuple((extent / np.linalg.norm(extent) * np.linalg.norm(drawn)).round(6).tolist()),
         split=facts["split"] if facts.get("split") in SPLITS else SPLITS[held_out],
