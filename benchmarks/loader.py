@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import csv
 import json
+import os
 import tempfile
 import time
 from collections.abc import Callable
@@ -139,11 +140,13 @@ def epoch(root: Path, cache_dir: Path, workers: int) -> dict[str, float]:
     for number, _ in enumerate(batches):
         if number % 50 == 0:
             memory.append(max(own_mebibytes(process.pid) for process in batches._workers))
+            done, own = number + 1, sum(cpu_seconds(process.pid) for process in batches._workers)
     seconds = time.perf_counter() - start - first
     return {
         f"opening {len(dataset)} scenes, s": opened,
         "  until the first batch, s": first,
         f"epoch, {workers} workers, ms a scene": 1e3 * seconds / (len(dataset) - 1),
+        "  processor time of the workers, ms a scene": 1e3 * own / done,
         "largest worker after a tenth, MiB": memory[len(memory) // 10],
         "largest worker after half, MiB": memory[len(memory) // 2],
         "largest worker at the end, MiB": memory[-1],
@@ -154,6 +157,12 @@ def own_mebibytes(process_id: int) -> float:
     """Return the memory of a process without what it maps from files or shares for transfer."""
     lines = Path(f"/proc/{process_id}/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("RssAnon")) / 1024
+
+
+def cpu_seconds(process_id: int) -> float:
+    """Return the processor time that a process has used, user and system."""
+    fields = Path(f"/proc/{process_id}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def open_dataset(root: Path, cache_dir: Path, **options: object) -> SceneDataset:
