@@ -281,6 +281,15 @@ def test_objects_outside_the_volume_are_counted(released, prepare, tmp_path):
     assert list(report["noticed"]["objects_outside_volume"]) == ["scene0001_00", "scene0002_00"]
 
 
+def test_mirrored_and_flat_objects_are_kept_and_counted(released, prepare, cube_entry, tmp_path):
+    more = [cube_entry(scale=(-1, 1, 1)), cube_entry(bbox=[0.5, 0.5, 0.0]), cube_entry(scale=(-1, -1, 1))]
+    rewrite(released, lambda found: found[2]["aligned_models"].extend(more))
+    report = prepare(released, tmp_path / "out").report
+    assert report["noticed"]["objects_mirrored"] == {"scene0002_00": ["03001627/cube"]}
+    assert report["noticed"]["objects_flat"] == {"scene0002_00": ["03001627/cube"]}
+    assert report["objects"]["val"]["chair"] == 4
+
+
 def test_frames_alone_need_no_annotation(released, prepare, tmp_path):
     report = prepare(released, tmp_path / "out", shapenet=None, scan2cad=None).report
     assert report["scans"]["prepared"] == 3

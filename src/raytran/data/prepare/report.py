@@ -4,19 +4,20 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from raytran.data.atomic import bytes_below
 from raytran.data.prepare.annotation import Annotations, Entry, LeftOut
 from raytran.data.prepare.scan import read_facts
 from raytran.data.prepare.sources import Sources
-from raytran.data.scan2cad import parse_entry, scene_objects
-from raytran.types import CLASSES
+from raytran.data.scan2cad import SceneAnnotation, parse_entry, scene_objects
+from raytran.types import CLASSES, ObjectSet
 
 
 @dataclass(frozen=True)
@@ -51,10 +52,12 @@ def make_report(
     """
     selection, found = sources.selection, sources.annotations or Annotations()
     facts = {scan: read_facts(output, scan) for scan in outcome.scans}
+    annotated = {scan: parse_entry(entry) for scan, entry in outcome.entries.items()}
+    objects = {scan: scene_objects(annotation) for scan, annotation in annotated.items()}
     membership = {split: [s for s in listed if s in facts] for split, listed in selection.splits.items()}
     return {
         "scans": {"prepared": len(facts)} | {split: len(names) for split, names in membership.items()},
-        "objects": _objects_by_class(outcome.entries, membership or {"all": list(facts)}),
+        "objects": _objects_by_class(objects, membership or {"all": list(facts)}),
         "frames": _frames(facts),
         "size": _sizes(output, facts),
         "left_out": {
@@ -71,7 +74,9 @@ def make_report(
             "duplicate_annotations": found.twice,
             "recordings_cut_short": _facts_that_say("cut", facts),
             "other_source_used": _facts_that_say("failed_sources", facts),
-            "objects_outside_volume": _outside(facts, outcome.entries, grid_extent),
+            "objects_outside_volume": _outside(facts, objects, grid_extent),
+            "objects_mirrored": _where(annotated, _is_mirrored),
+            "objects_flat": _where(annotated, _is_flat),
             "damaged_images": _facts_that_say("damaged", facts),
         },
     }
@@ -82,15 +87,12 @@ def _facts_that_say(key: str, facts: Mapping[str, dict[str, Any]]) -> dict[str, 
 
 
 def _objects_by_class(
-    entries: Mapping[str, Entry], membership: Mapping[str, Sequence[str]]
+    objects: Mapping[str, ObjectSet], membership: Mapping[str, Sequence[str]]
 ) -> dict[str, dict[str, int]]:
     """Return the number of objects of each class, by split."""
     table = {}
     for split, scans in membership.items():
-        labels: Counter[int] = Counter()
-        for scan in scans:
-            if scan in entries:
-                labels.update(scene_objects(parse_entry(entries[scan])).label.tolist())
+        labels = Counter(label for scan in scans if scan in objects for label in objects[scan].label.tolist())
         table[split] = {name: labels[index] for index, name in enumerate(CLASSES)}
     return table
 
@@ -119,16 +121,32 @@ def _sizes(output: Path, facts: Mapping[str, dict[str, Any]]) -> dict[str, int]:
 
 
 def _outside(
-    facts: Mapping[str, dict[str, Any]], entries: Mapping[str, Entry], extent: tuple[float, float, float]
+    facts: Mapping[str, dict[str, Any]], objects: Mapping[str, ObjectSet], extent: tuple[float, float, float]
 ) -> dict[str, list[str]]:
     """Return the models whose centre is not in the volume around the mean of all cameras, by scan."""
     half = torch.tensor(extent, dtype=torch.float64) / 2
     outside = {}
-    for scan in facts.keys() & entries.keys():
-        objects = scene_objects(parse_entry(entries[scan]))
-        offset = objects.center.double() - torch.tensor(facts[scan]["camera_center"], dtype=torch.float64)
-        far = (offset.abs() > half).any(dim=1).tolist()
-        names = [name for name, is_far in zip(objects.model_id, far, strict=True) if is_far]
-        if names:
-            outside[scan] = names
-    return dict(sorted(outside.items()))
+    for scan, found in objects.items():
+        offset = found.center.double() - torch.tensor(facts[scan]["camera_center"], dtype=torch.float64)
+        outside[scan] = _names(found.model_id, (offset.abs() > half).any(dim=1))
+    return {scan: names for scan, names in outside.items() if names}
+
+
+def _where(
+    annotated: Mapping[str, SceneAnnotation], test: Callable[[SceneAnnotation], Tensor]
+) -> dict[str, list[str]]:
+    """Return the models that pass a test, by scan."""
+    passed = {scan: _names(found.model_id, test(found)) for scan, found in annotated.items()}
+    return {scan: names for scan, names in passed.items() if names}
+
+
+def _is_mirrored(found: SceneAnnotation) -> Tensor:
+    return torch.linalg.det(found.scan_from_cad[:, :3, :3]) < 0
+
+
+def _is_flat(found: SceneAnnotation) -> Tensor:
+    return (found.box_half_size <= 0).any(dim=1)
+
+
+def _names(model_ids: Sequence[str], chosen: Tensor) -> list[str]:
+    return [name for name, is_chosen in zip(model_ids, chosen.tolist(), strict=True) if is_chosen]
