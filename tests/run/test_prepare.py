@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,17 @@ def test_furniture_and_checks_are_passed_on(called):
     cfg = config("check=some/scan")
     assert prepare(cfg) == "check"
     assert called["check"] == ((cfg,), {})
+
+
+def test_commands_of_the_documentation_compose(project_root):
+    text = (project_root / "docs" / "data.md").read_text(encoding="utf-8")
+    commands = re.findall(r"python -m raytran\.prepare ([^`\n]+)", text)
+    assert len(commands) >= 6
+    for words in commands:
+        compose("prepare", words.split())
+    options = re.findall(r"^\| `([^`]+=[^`]+)` \|", text, flags=re.MULTILINE)
+    assert len(options) == 5
+    compose("prepare", options)
 
 
 @pytest.mark.parametrize(
