@@ -18,7 +18,7 @@ from PIL import Image
 from raytran.data.dataset import scan2cad_dataset
 from raytran.data.prepare import PrepareSettings, Released, prepare_scan2cad
 from raytran.data.scan2cad import read_annotations
-from raytran.data.scannet import read_scan
+from raytran.data.scannet import read_scan, read_sens
 from raytran.errors import ConfigError, DataError
 
 SETTINGS = PrepareSettings((16, 24), max_frames=3)
@@ -60,6 +60,47 @@ def test_frames_cameras_models_and_lists(released, prepare, tmp_path):
     assert report["objects"]["train"]["chair"] == 2
     assert not any(report["left_out"].values())
     assert not any(report["noticed"].values())
+
+
+@pytest.mark.parametrize("form", ["cpp", "odam", "mmdetection3d", "frames_25k"])
+def test_every_form_gives_the_same_files(released, prepare, scan_in_form, digests, tmp_path, form):
+    prepare(released, tmp_path / "whole")
+    shutil.rmtree(released / SCAN)
+    scan_in_form(form, released / "scannet" / "elsewhere" / "scene0000_00")
+    report = prepare(released, tmp_path / "out").report
+    assert report["frames"]["forms"] == {"exporter": 2, form: 1}
+    differ = digests(tmp_path / "whole").items() ^ digests(tmp_path / "out").items()
+    assert {name for name, _ in differ} == {"report.json", "report.txt", str(SCAN / "prepared.json")}
+
+
+def test_recordings_are_read_and_one_that_ends_early_is_named(released, prepare, write_sens, tmp_path):
+    for number in (0, 1):
+        shutil.rmtree(released / SCAN.with_name(f"scene000{number}_00"))
+        path = write_sens(f"scene000{number}_00", frames=8, lost=[2], root=released)
+    path.write_bytes(path.read_bytes()[:-2500])
+    report = prepare(released, tmp_path / "out", settings=PrepareSettings((32, 48), max_frames=None)).report
+    assert report["frames"]["forms"] == {"exporter": 1, "sens": 2}
+    assert report["frames"]["dropped"]["pose is not finite or no rigid motion"] == 2
+    (cut,) = report["noticed"]["recordings_cut_short"].items()
+    assert cut[0] == "scene0001_00"
+    assert "ends after 5 of the 8 frames" in cut[1]
+    whole = read_scan(tmp_path / "out" / SCAN)
+    assert whole.frame_id == ("0", "1", "3", "4", "5", "6", "7")
+    with read_sens(released / SCAN / "scene0000_00.sens") as recording:
+        assert torch.equal(recording.world_from_camera, whole.world_from_camera)
+        assert recording.color_bytes(3) == whole.image_path[3].read_bytes()
+    part = read_scan(tmp_path / "out" / SCAN.with_name("scene0001_00"))
+    assert part.frame_id == whole.frame_id[: len(part)]
+
+
+def test_the_best_form_is_taken_and_the_next_if_it_is_damaged(released, prepare, write_sens, tmp_path):
+    write_sens(root=released)
+    assert prepare(released, tmp_path / "a").report["frames"]["forms"] == {"exporter": 2, "sens": 1}
+    (released / SCAN / "scene0000_00.sens").write_bytes(b"damaged")
+    report = prepare(released, tmp_path / "b").report
+    assert report["frames"]["forms"] == {"exporter": 3}
+    (reasons,) = report["noticed"]["other_source_used"].values()
+    assert "scene0000_00.sens is no .sens recording" in reasons[0]
 
 
 def test_a_frame_of_the_right_size_keeps_its_bytes(released, prepare, tmp_path):

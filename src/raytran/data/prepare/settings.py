@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 from raytran.data.atomic import write_json
 from raytran.errors import ConfigError, DataError
@@ -73,13 +72,20 @@ def claimed(output: Path, settings: PrepareSettings, sources: dict[str, Any]) ->
             "choose another output folder or remove this one"
         )
     with path.open(encoding="utf-8") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise DataError(
-                f"another process prepares {output}: wait for it to end, or choose another folder"
-            ) from error
-        except OSError:
-            # Some network disks cannot lock; then it is for the user not to start two at once.
-            pass
+        _lock(file, output)
         yield
+
+
+def _lock(file: TextIO, output: Path) -> None:
+    """Lock ``file`` until it is closed; where that cannot be done it is for the user not to start two."""
+    try:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise DataError(
+            f"another process prepares {output}: wait for it to end, or choose another folder"
+        ) from error
+    except (ImportError, OSError):
+        # Windows, and some network disks.
+        return
