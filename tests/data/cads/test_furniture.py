@@ -153,6 +153,39 @@ def test_a_broken_piece_is_left_out_and_named(fields, why, tmp_path, write_libra
     assert sorted(item.name for item in tmp_path.iterdir()) == ["a.sh3f", "out"]
 
 
+ODD_MESHES = {
+    "flat": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "flat"),
+    "not finite": ("v 0 0 0\nv 1 0 nan\nv 0 1 1\nf 1 2 3\n", "triangles"),
+    "a corner that is not there": ("v 0 0 0\nv 1 0 0\nv 0 1 1\nf 1 2 9\n", "damaged"),
+}
+
+
+@pytest.mark.parametrize(("obj", "why"), ODD_MESHES.values(), ids=ODD_MESHES)
+def test_a_mesh_that_is_none_is_left_out(obj, why, tmp_path, write_library, entry):
+    files = {"scopia/odd.obj": obj}
+    path = write_library(tmp_path / "a.sh3f", entry(1, "Scopia#chair", model="/scopia/odd.obj"), **files)
+    report = import_furniture(path, tmp_path / "out", **QUIET)
+    assert why in report.left_out["Scopia#chair"]
+
+
+def test_a_mesh_of_too_many_triangles_is_left_out(library, tmp_path, monkeypatch):
+    monkeypatch.setattr("raytran.data.cads.mesh.MOST_FACES", 35)
+    assert "36 triangles" in import_furniture(library, tmp_path, **QUIET).left_out["Scopia#chair"]
+
+
+@pytest.mark.parametrize("mtllib", ["none.mtl", "../../../../etc/passwd", "LICENSE.TXT"])
+def test_materials_that_are_not_there_are_grey(mtllib, tmp_path, write_library, entry):
+    files = {
+        "scopia/odd.obj": f"mtllib {mtllib}\nv 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nusemtl x\nf 1 2 3\nf 1 2 4\n"
+    }
+    path = write_library(tmp_path / "a.sh3f", entry(1, "Scopia#chair", model="/scopia/odd.obj"), **files)
+    report = import_furniture(path, tmp_path / "out", **QUIET)
+    folder = model_folder(tmp_path / "out", *report.credits[0].model.split("/"))
+    (line,) = [line for line in (folder / "model_normalized.mtl").read_text().splitlines() if "Kd" in line]
+    red, green, blue = map(float, line.split()[1:])
+    assert red == green == blue
+
+
 def test_a_piece_of_hostile_size_is_not_read(tmp_path, write_library, entry, monkeypatch):
     monkeypatch.setattr("raytran.data.cads.catalogue.LARGEST_ENTRY", 2**20)
     huge = {"scopia/huge.obj": "v 0 0 0\n" * 200_000}
