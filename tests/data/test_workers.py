@@ -11,6 +11,7 @@ import time
 import pytest
 
 from raytran.data.workers import work_on
+from raytran.errors import DataError
 
 
 def test_each_item_once_in_this_process():
@@ -37,6 +38,11 @@ def pid_of_worker(_):
 def test_an_error_reaches_the_caller():
     with pytest.raises(ValueError, match=r"math domain error|nonnegative"):
         list(work_on([1, -1, 1], math.sqrt, label="x", processes=2, progress=False))
+
+
+def test_a_worker_that_is_killed_is_one_sentence():
+    with pytest.raises(DataError, match="smaller processes="):
+        list(work_on([9, 9, 9], os._exit, label="x", processes=2, progress=False))
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="needs Linux to look at processes")

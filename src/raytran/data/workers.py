@@ -10,10 +10,13 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from itertools import islice
 from typing import TypeVar
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from raytran.errors import DataError
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -41,6 +44,9 @@ def work_on(
         processes: 0 for one per core; 1 works in this process.
         items_each: fewest items for which another process is worth its start.
         progress: show a progress bar.
+
+    Raises:
+        DataError: a process was ended from outside; and whatever ``function`` raises.
     """
     workers = min(processes or os.cpu_count() or 1, len(items) // items_each)
     columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
@@ -62,13 +68,25 @@ def _at_once(items: Sequence[Item], function: Callable[[Item], Result], workers:
         _one_thread_each(),
         ProcessPoolExecutor(workers, mp_context=context, initializer=_become_worker) as pool,
     ):
-        waiting = iter(items)
-        running = {pool.submit(function, item) for item in islice(waiting, workers)}
-        while running:
-            done, running = wait(running, return_when=FIRST_COMPLETED)
-            running |= {pool.submit(function, item) for item in islice(waiting, len(done))}
-            for future in done:
-                yield future.result()
+        try:
+            yield from _handed_out(items, function, workers, pool)
+        except BrokenProcessPool as error:
+            raise DataError(
+                "a worker process was ended from outside, perhaps because memory ran out: "
+                "give the same command again with a smaller processes="
+            ) from error
+
+
+def _handed_out(
+    items: Sequence[Item], function: Callable[[Item], Result], workers: int, pool: ProcessPoolExecutor
+) -> Iterator[Result]:
+    waiting = iter(items)
+    running = {pool.submit(function, item) for item in islice(waiting, workers)}
+    while running:
+        done, running = wait(running, return_when=FIRST_COMPLETED)
+        running |= {pool.submit(function, item) for item in islice(waiting, len(done))}
+        for future in done:
+            yield future.result()
 
 
 def _become_worker() -> None:

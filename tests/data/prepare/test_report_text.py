@@ -24,7 +24,7 @@ def test_text_has_the_counts_and_the_names(released, prepare, tmp_path):
     text = prepare(released, tmp_path / "out").text
     assert text == (tmp_path / "out" / "report.txt").read_text()
     assert "3 prepared: train 2 (paper 1194), val 1 (paper 306)" in text
-    assert "Frames   9 written of 12" in text
+    assert "Frames   9 written of 12\n         3 not taken because of max_frames\n" in text
     rows = {line.split()[0]: line.split()[1:] for line in text.splitlines() if line.startswith(" " * 9)}
     assert rows["chair"] == ["2", "1", "1093"]
     assert rows["all"] == ["2", "1", "3184"]

@@ -74,6 +74,11 @@ def _counts(report: Mapping[str, Any]) -> Iterable[str]:
     yield f"Frames   {frames['written']} written of {frames['in_scans']}"
     for reason, count in frames["dropped"].items():
         yield f"         {count} dropped: {reason}"
+    others = (
+        frames["in_scans"] - frames["written"] - sum(frames["dropped"].values()) - frames["damaged_images"]
+    )
+    if others:
+        yield f"         {others} not taken because of max_frames"
     if frames["damaged_images"]:
         yield f"         {frames['damaged_images']} dropped: damaged image"
     yield (
