@@ -10,6 +10,7 @@ import numpy as np
 import torch
 import trimesh
 from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ from raytran.view.palette import FAINT, INK, class_hex
 from raytran.view.wireframe import NEAR, box_corners
 
 _UP = "#d62728"
-_SHOWN_POINTS = 4000
+_SHOWN_POINTS, _SHOWN_RAYS = 4000, 250
 _FRAME_WIDTH = 480
 _RAY = 0.06
 """Length of the drawn view rays as a share of the plan's width."""
@@ -145,8 +146,9 @@ def _draw_panel(
     margin = 0.06 * float((high - low).max()) + 1e-6
     ray = _RAY * float((high - low).max())
     axes.plot(*position.T, color=FAINT, linewidth=0.8, zorder=5)
-    for start, way in zip(position, forward, strict=True):
-        axes.plot(*np.stack([start, start + ray * way]).T, color=INK, linewidth=0.6, zorder=5)
+    step = -(-len(position) // _SHOWN_RAYS)
+    rays = np.stack([position, position + ray * forward], axis=1)[::step]
+    axes.add_collection(LineCollection(list(rays), colors=INK, linewidths=0.6, zorder=5))
     axes.plot(*position[:1].T, "o", color=INK, markersize=6, markerfacecolor="white", zorder=6)
     middle = poses[:, :3, 3].mean(axis=0)[pair]
     sides = np.array(extent)[pair]

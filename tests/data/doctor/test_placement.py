@@ -87,6 +87,24 @@ def test_a_side_that_was_moved_is_named(objects, room, applied, cause):
     np.testing.assert_allclose(moved @ applied, np.eye(4), atol=1e-9)
 
 
+def test_a_reading_that_catches_fewer_rays_is_no_better(objects, room):
+    sightings, poses = room
+    away = np.array([6.0, 6, 0])
+    spot = np.repeat(CENTERS[:1] + away, 40, axis=0) - poses[0, :3, 3]
+    through = Sightings(
+        np.zeros(640, dtype=np.int64),
+        np.concatenate([sightings.ray, spot]),
+        np.concatenate([np.where(np.arange(600) % 2, 1.0, 3.0), np.ones(40)]),
+        "a test",
+    )
+    moved = alignment(0, *away[:2])
+    given = weigh(through, poses, objects, np.eye(4))
+    purer = weigh(through, poses, objects, np.linalg.inv(moved))
+    assert given.inside > 2 * purer.inside
+    assert purer.score > given.score + 0.12
+    assert check_placement(through, poses, objects, moved)[1].state == "ok"
+
+
 def test_boxes_of_another_scan_are_astray(objects, room):
     sightings, poses = room
     elsewhere = replace(objects, center=objects.center + torch.tensor([0.0, 0.0, 30.0]))

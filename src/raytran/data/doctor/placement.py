@@ -18,7 +18,7 @@ _SLACK = 0.05
 _FEWEST_RAYS = 25
 """Rays ending in boxes below which the best reading is not believed."""
 
-_POOR, _CLEARLY_BETTER = 0.15, 0.12
+_POOR, _CLEARLY_BETTER, _MORE_INSIDE = 0.15, 0.12, 1.3
 _IDLE = 0.05
 """Weight of rays that meet no box: a reading that moves all boxes out of sight must not win."""
 
@@ -153,9 +153,15 @@ def check_placement(
     given = weigh(sightings, world_from_camera, objects, np.eye(4))
     readings = alignment_readings(axis_alignment) + turn_readings()
     weighed = [weigh(sightings, world_from_camera, objects, reading.right_from_given) for reading in readings]
-    best = max(range(len(readings)), key=lambda i: weighed[i].score)
+    # A reading that moves boxes to where little is seen may look purer; it must catch more rays, too.
+    rivals = [i for i, after in enumerate(weighed) if after.inside > _MORE_INSIDE * given.inside]
+    best = max(rivals, key=lambda i: weighed[i].score, default=None)
     seen = f"{given.inside} rays end in the boxes and {given.through} pass through ({sightings.source})"
-    if weighed[best].score > given.score + _CLEARLY_BETTER and weighed[best].inside >= _FEWEST_RAYS:
+    if (
+        best is not None
+        and weighed[best].score > given.score + _CLEARLY_BETTER
+        and weighed[best].inside >= _FEWEST_RAYS
+    ):
         reading, after = readings[best], weighed[best]
         text = f"{seen}; after the change {after.inside} and {after.through}"
         sure = "certain" if after.score > 3 * given.score and after.inside > 4 * _FEWEST_RAYS else "likely"
