@@ -19,16 +19,16 @@ _PREFIX = "model."
 
 
 def checkpoint_card(
-    *, stage: str, preset: str, model: Mapping[str, Any], views: Mapping[str, Any], parent: str | None
+    *, stage: str, preset: str, config: Mapping[str, Any], parent: Mapping[str, Any] | None
 ) -> dict[str, Any]:
     """Return the plain Python that identifies a checkpoint.
 
     Args:
         stage: name of the stage.
         preset: name of the preset.
-        model: resolved config of the model.
-        views: ``image_size`` [H, W], ``num_views`` in training and ``predict_views``.
-        parent: path of the checkpoint that the fit started from, or None.
+        config: all settings of the run, resolved; ``model`` rebuilds the network, ``views`` holds
+            ``image_size`` [H, W], ``num_views`` in training and ``predict_views``.
+        parent: the checkpoint that the fit started from (``path``, ``stage``, ``step``, ``scores``), or None.
     """
     from raytran.run.provenance import git_commit, versions
 
@@ -36,9 +36,10 @@ def checkpoint_card(
         "format": FORMAT,
         "stage": stage,
         "preset": preset,
-        "model": dict(model),
-        "views": dict(views),
-        "parent": parent,
+        "model": copy.deepcopy(config["model"]),
+        "views": copy.deepcopy(config["views"]),
+        "config": copy.deepcopy(dict(config)),
+        "parent": None if parent is None else dict(parent),
         "git_commit": git_commit(),
         "versions": versions(),
     }
