@@ -91,8 +91,8 @@ def test_scans_without_annotation_from_the_command_line(tmp_path, caplog):
     marker = json.loads((tmp_path / "out" / "prepare.json").read_text())
     assert (marker["image_size"], marker["max_frames"], marker["masks"]) == ([120, 160], 2, False)
     said = [record.getMessage() for record in caplog.records]
-    assert "1 scans to take (1 exporter)" in said[0]
-    assert "about 2 frames: expect" in said[1]
+    assert "found: scans 1 (exporter 1); no CAD models" in said[0]
+    assert "scans 1, frames about 2; expect" in said[1]
     assert said[-1] == f"python -m raytran.train data=scan2cad data.root={tmp_path / 'out'}"
 
 

@@ -44,7 +44,5 @@ def test_what_cannot_be_tried_does_not_stop_the_estimate(sources, released, tmp_
 
 def test_words():
     text = str(Estimate(scans=2, frames=400, num_bytes=2.4e9, seconds=7200.0, free=10_000_000_000))
-    assert text == (
-        "2 scans to prepare, about 400 frames: expect 2.4 GB on disk (10.0 GB are free) and 2.0 hours"
-    )
-    assert "and 1 minute" in str(Estimate(scans=1, frames=2, num_bytes=10.0, seconds=3.0, free=1))
+    assert text == ("to do: scans 2, frames about 400; expect 2.4 GB on disk (10.0 GB are free) and 2.0 h")
+    assert "and 1 min" in str(Estimate(scans=1, frames=2, num_bytes=10.0, seconds=3.0, free=1))

@@ -306,7 +306,7 @@ def test_without_a_single_usable_scan_the_command_fails(released, prepare, tmp_p
         path.unlink()
     with pytest.raises(DataError, match=r"no scan could be prepared \(.*intrinsic_color.txt is missing"):
         prepare(released, tmp_path / "out")
-    assert "3 scans that cannot be read" in (tmp_path / "out" / "report.txt").read_text()
+    assert "scans that cannot be read: 3" in (tmp_path / "out" / "report.txt").read_text()
 
 
 def test_a_scan_in_two_places_is_taken_once(released, prepare, tmp_path):

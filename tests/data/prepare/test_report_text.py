@@ -28,7 +28,7 @@ def test_text_has_the_counts_and_the_names(released, prepare, tmp_path):
     rows = {line.split()[0]: line.split()[1:] for line in text.splitlines() if line.startswith(" " * 9)}
     assert rows["chair"] == ["2", "1", "1093"]
     assert rows["all"] == ["2", "1", "3184"]
-    assert "  7 scans without annotation\n    scene0100_00, scene0101_00, " in text
+    assert "  scans without annotation: 7\n    scene0100_00, scene0101_00, " in text
     assert "scene0104_00, … and 2 more in" in text
     assert "scene0105_00" not in text
     assert "Noticed\n  nothing\n" in text

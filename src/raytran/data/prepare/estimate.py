@@ -50,9 +50,9 @@ class Estimate:
 
     def __str__(self) -> str:
         minutes = self.seconds / 60
-        duration = f"{minutes / 60:.1f} hours" if minutes > 90 else f"{max(minutes, 1):.0f} minutes"
+        duration = f"{minutes / 60:.1f} h" if minutes > 90 else f"{max(minutes, 1):.0f} min"
         return (
-            f"{self.scans} scans to prepare, about {self.frames} frames: expect {gigabytes(self.num_bytes)} "
+            f"to do: scans {self.scans}, frames about {self.frames}; expect {gigabytes(self.num_bytes)} "
             f"on disk ({gigabytes(self.free)} are free) and {duration}"
         )
 

@@ -68,9 +68,9 @@ def _counts(report: Mapping[str, Any]) -> Iterable[str]:
         f"{split} {count}{_paper(split)}" for split, count in scans.items() if split != "prepared"
     )
     yield f"Scans    {scans['prepared']} prepared" + (f": {splits}" if splits else ", no split files")
-    sizes = ", ".join(f"{count} scans of {size}" for size, count in frames["stored_sizes"].items())
-    forms = ", ".join(f"{count} {form}" for form, count in frames["forms"].items())
-    yield f"         read from {sizes}; forms: {forms}"
+    for what in ("forms", "stored_sizes"):
+        counts = ", ".join(f"{name} {count}" for name, count in frames[what].items())
+        yield f"         {what.replace('_', ' ')}: {counts}"
     yield f"Frames   {frames['written']} written of {frames['in_scans']}"
     for reason, count in frames["dropped"].items():
         yield f"         {count} dropped: {reason}"
@@ -105,7 +105,7 @@ def _objects_left_out(objects: Iterable[Mapping[str, str]]) -> list[str]:
     for part in objects:
         name = f"{part['scan']}: {part['model']}" if part["model"] else part["scan"]
         by_reason.setdefault(part["reason"], []).append(name)
-    return [line for reason, names in by_reason.items() for line in _named(f"objects: {reason}", names)]
+    return [line for reason, names in by_reason.items() for line in _named(f"objects, {reason}", names)]
 
 
 def _named(what: str, names: Sequence[str] | Mapping[str, Any]) -> list[str]:
@@ -116,10 +116,8 @@ def _named(what: str, names: Sequence[str] | Mapping[str, Any]) -> list[str]:
     first = list(names)[:_NAMES_SHOWN]
     rest = [f"… and {len(names) - len(first)} more in report.json"] if len(names) > len(first) else []
     if any(isinstance(known.get(name), str) for name in first):
-        return [
-            f"  {len(names)} {what}",
-            *(f"    {name}: {known[name]}" for name in first),
-            *(f"    {r}" for r in rest),
-        ]
-    lines = fill(", ".join(first + rest), _WIDTH - 4, break_long_words=False, break_on_hyphens=False)
-    return [f"  {len(names)} {what}", *(f"    {line}" for line in lines.splitlines())]
+        lines = [*(f"{name}: {known[name]}" for name in first), *rest]
+    else:
+        text = ", ".join(first + rest)
+        lines = fill(text, _WIDTH - 4, break_long_words=False, break_on_hyphens=False).splitlines()
+    return [f"  {what}: {len(names)}", *(f"    {line}" for line in lines)]

@@ -54,14 +54,12 @@ class Sources:
 
     def __str__(self) -> str:
         jobs = self.selection.jobs
-        forms = Counter(job.sources[0].form for job in jobs).most_common()
+        counts = Counter(job.sources[0].form for job in jobs).most_common()
+        forms = ", ".join(f"{form} {count}" for form, count in counts)
         models = (
             "no CAD models" if self.shapenet is None else f"ShapeNetCore {shapenet_version(self.shapenet)}"
         )
-        return (
-            f"found {len(jobs)} scans to take ({', '.join(f'{count} {form}' for form, count in forms)}), "
-            f"{models}, {self.annotation_path or 'no annotations'}"
-        )
+        return f"found: scans {len(jobs)} ({forms}); {models}; {self.annotation_path or 'no annotations'}"
 
 
 def read_sources(released: Released, output: Path) -> Sources:
