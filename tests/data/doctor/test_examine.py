@@ -100,6 +100,12 @@ def test_intrinsics_that_a_loader_would_refuse_are_diagnosed(copy):
     assert [finding.cause for finding in diagnose(copy).faults] == ["intrinsics for another image size"]
 
 
+def test_a_damaged_alignment_is_named_and_does_no_harm(copy):
+    path = copy / "scannet" / "scans" / SCAN / f"{SCAN}.txt"
+    path.write_text("axisAlignment = " + "0 " * 16)
+    assert [finding.cause for finding in diagnose(copy).faults] == ["damaged axisAlignment"]
+
+
 def test_left_handed_poses_are_diagnosed(copy):
     spoil_poses(copy, lambda pose: pose @ np.diag([1.0, -1, 1, 1]))
     result = diagnose(copy)

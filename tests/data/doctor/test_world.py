@@ -32,6 +32,12 @@ def test_feet_need_depth_maps():
     assert scale == 0.3048
 
 
+def test_a_scale_that_no_unit_explains_is_guessed_from_the_size_of_rooms():
+    scale, finding = check_unit(DISTANCES * 1e9, None)
+    assert finding.cause == "positions in no known unit"
+    assert 1 < np.median(DISTANCES) * 1e9 * scale < 5
+
+
 def test_an_arbitrary_scale_is_measured():
     scale, finding = check_unit(DISTANCES * 1.7, DISTANCES)
     assert finding.cause == "positions in no known unit"
@@ -55,8 +61,8 @@ def test_another_up_is_named_and_mended(walk, name):
     assert np.linalg.det(turn) == pytest.approx(1)
     lying = walk[0].copy()
     lying[:, :3] = turn.T @ lying[:, :3]
-    axis, finding = check_up(lying)
-    np.testing.assert_array_equal(axis, AXES[name])
+    found, finding = check_up(lying)
+    np.testing.assert_array_equal(found, turn)
     assert (finding.state, finding.cause, finding.confidence) == ("fault", f"wrong up ({name})", "certain")
     assert str(turn.astype(int).tolist()) in finding.fix
 
@@ -67,19 +73,35 @@ def test_a_level_walk_is_right_and_a_leaning_one_is_noted(walk):
     turn = np.array([[1, 0, 0], [0, np.cos(lean), -np.sin(lean)], [0, np.sin(lean), np.cos(lean)]])
     leaning = walk[0].copy()
     leaning[:, :3] = turn @ leaning[:, :3]
-    axis, finding = check_up(leaning)
-    assert axis is None
+    turn, finding = check_up(leaning)
+    assert turn is None
     assert finding.state == "note"
     assert "20°" in finding.text
 
 
 def test_one_way_of_looking_tells_up_by_the_tops_of_the_images(walk):
     still = np.tile(walk[0][:1], (5, 1, 1))
-    axis, finding = check_up(still)
-    assert axis is None
+    turn, finding = check_up(still)
+    assert turn is None
     assert finding.state == "ok"
     still[:, :3] = np.diag([1.0, -1.0, -1.0]) @ still[:, :3]
     assert check_up(still)[1].confidence == "likely"
+    down = np.radians(40)
+    pitch = np.array([[1, 0, 0], [0, np.cos(down), np.sin(down)], [0, -np.sin(down), np.cos(down)]])
+    looks_down = np.tile(walk[0][:1], (5, 1, 1))
+    looks_down[:, :3, :3] = looks_down[:, :3, :3] @ pitch
+    assert check_up(looks_down)[1].state == "ok"
+
+
+def test_a_world_that_leans_far_is_levelled(walk):
+    lean = np.radians(60)
+    turn = np.array([[1, 0, 0], [0, np.cos(lean), -np.sin(lean)], [0, np.sin(lean), np.cos(lean)]])
+    leaning = walk[0].copy()
+    leaning[:, :3] = turn @ leaning[:, :3]
+    found, finding = check_up(leaning)
+    assert finding.cause == "world not level"
+    np.testing.assert_allclose(found, turn.T, atol=0.05)
+    assert str(found.round(4).tolist()) in finding.fix
 
 
 def test_the_volume_holds_a_room_but_not_a_hall():

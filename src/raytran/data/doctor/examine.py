@@ -19,12 +19,12 @@ from raytran.data.doctor.models import check_models
 from raytran.data.doctor.placement import ASTRAY, check_placement, weigh
 from raytran.data.doctor.recording import Recording
 from raytran.data.doctor.sightings import Sightings, depth_at, sightings_from_depth, sightings_from_matches
-from raytran.data.doctor.world import check_unit, check_up, check_volume, turn_to_z
+from raytran.data.doctor.world import check_unit, check_up, check_volume
 from raytran.data.scan import OpenScan
 from raytran.data.scan2cad import SceneAnnotation, scene_objects
 from raytran.data.scan_layout import find_layout
 from raytran.data.scan_sources import ScanSource
-from raytran.data.scan_text import read_matrix
+from raytran.data.scan_text import are_rigid, read_matrix
 from raytran.errors import DataError
 from raytran.types import ObjectSet
 
@@ -154,20 +154,24 @@ def _check_world(result: Examination, recording: Recording, sightings: Sightings
     findings: list[Finding] = []
     if len(objects):
         objects, findings = check_boxes(objects)
-    axis, up = check_up(correction.apply(stored))
-    if axis is not None:
+    level, up = check_up(correction.apply(stored))
+    if level is not None:
         turn = np.eye(4)
-        turn[:3, :3] = turn_to_z(axis)
+        turn[:3, :3] = level
         together = weigh(sightings, correction.apply(stored), objects, np.eye(4)).score
         if together > weigh(sightings, correction.apply(stored), objects, turn).score:
-            objects, findings = turned(objects, turn[:3, :3]), findings[:1]
+            objects, findings = turned(objects, level), findings[:1]
             up = replace(up, fix=f"{up.fix}, and the annotation's scan transforms likewise")
         correction = replace(correction, world_turn=turn)
     findings.append(up)
+    alignment = recording.axis_alignment
+    if not are_rigid(alignment[None])[0]:
+        text = "axisAlignment in the scan's text file is no rigid motion"
+        fix = "take it from ScanNet again, or remove the line"
+        findings.append(Finding("axisAlignment", "fault", text, "damaged axisAlignment", fix, "certain"))
+        alignment = np.eye(4)
     if len(objects):
-        moved, placed = check_placement(
-            sightings, correction.apply(stored), objects, recording.axis_alignment
-        )
+        moved, placed = check_placement(sightings, correction.apply(stored), objects, alignment)
         correction = replace(correction, world_turn=moved @ correction.world_turn)
         findings.append(placed)
     return replace(result, findings=(*result.findings, *findings), correction=correction, objects=objects)

@@ -27,6 +27,8 @@ _LIKELY_UNITS = ("centimetres", "millimetres", "kilometres")
 """Those that are guessed from the size of things alone; feet and inches need depth maps to be told."""
 
 _TILTED_DEG, _WRONG_DEG = 12.0, 35.0
+_OFF_AXIS_DEG = 15.0
+"""Up within this angle of an axis of the world is taken for the axis."""
 
 _MANY_OUTSIDE = 0.25
 """Share of cameras outside the volume that is a fault; a long walk has some."""
@@ -62,7 +64,8 @@ def check_unit(depth: NDArray[np.float64], measured: NDArray[np.float64] | None)
             key=lambda value: abs(math.log(middle * value / _TYPICAL)),
         )
     names = [name for name, value in _UNITS.items() if abs(math.log(scale / value)) < 0.2]
-    metres = _UNITS[names[0]] if names else scale
+    names = [name for name in names if _NEAR < middle * _UNITS[name] < _FAR]
+    metres = _UNITS[names[0]] if names else scale if known.sum() >= 20 else _TYPICAL / middle
     return metres, Finding(
         "unit",
         "fault",
@@ -77,51 +80,55 @@ def check_up(world_from_camera: NDArray[np.float64]) -> tuple[NDArray[np.float64
     """Say where up is, supposing that cameras are held level and turn about.
 
     The direction to which all image rows are at right angles is up, signed by the images' tops; where the
-    camera hardly turns the mean of the tops alone must do.
+    camera hardly turns the mean of the tops alone must do, and a camera that looks down tilts it.
 
     Returns:
-        ``(3,)`` the axis of the world nearest to up, or None if it is +z or cannot be told; and the finding.
+        ``(3, 3)`` the turn that takes up to +z, or None if it is there or cannot be told; and the finding.
     """
     right, top = world_from_camera[:, :3, 0], -world_from_camera[:, :3, 1]
     mean = top.mean(axis=0)
     spread, axes = np.linalg.eigh(right.T @ right / len(right))
-    if spread[1] > 0.05 and spread[0] < 0.25 * spread[1]:
+    turns_about = spread[1] > 0.05 and spread[0] < 0.25 * spread[1]
+    if turns_about:
         up = axes[:, 0] * np.sign(axes[:, 0] @ mean or 1.0)
-        sure = "certain" if abs(axes[:, 0] @ mean) > 0.5 else "likely"
     elif np.linalg.norm(mean) > 0.5:
-        up, sure = mean / np.linalg.norm(mean), "likely"
+        up = mean / np.linalg.norm(mean)
     else:
         return None, Finding("up", "unknown", "cameras are turned in all ways, so up cannot be told")
     off = math.degrees(math.acos(float(np.clip(up[2], -1, 1))))
     seen = f"up by the cameras is ({up[0]:+.2f}, {up[1]:+.2f}, {up[2]:+.2f}), {off:.0f}° from +z"
-    if off < _TILTED_DEG:
-        return None, Finding("up", "ok", seen)
-    if off < _WRONG_DEG:
-        return None, Finding(
-            "up", "note", f"{seen}: objects are taken to stand upright, so turn the world if it leans"
-        )
     nearest = int(np.abs(up).argmax())
     axis = np.eye(3)[nearest] * np.sign(up[nearest])
-    name = f"{'-' if axis[nearest] < 0 else '+'}{'xyz'[nearest]}"
-    turn = turn_to_z(axis).astype(int).tolist()
-    return axis, Finding(
-        "up",
-        "fault",
-        seen,
-        f"wrong up ({name})",
-        f"multiply rotation and position of each camera-to-world matrix from the left by {turn}",
-        sure,
-    )
+    if off < _TILTED_DEG:
+        return None, Finding("up", "ok", seen)
+    if not turns_about and axis[2] > 0:
+        return None, Finding("up", "ok", f"{seen}, as far as cameras that look one way can tell")
+    if off < _WRONG_DEG:
+        text = f"{seen}: objects are taken to stand upright, so turn the world if it leans"
+        return None, Finding("up", "note", text)
+    return _wrong_up(up, axis, seen, "certain" if turns_about and abs(up @ mean) > 0.5 else "likely")
 
 
-def turn_to_z(axis: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the ``(3, 3)`` turn of at most half a circle that takes a coordinate axis to +z."""
+def _wrong_up(up: NDArray, axis: NDArray, seen: str, sure: str) -> tuple[NDArray[np.float64], Finding]:
+    if up @ axis > math.cos(math.radians(_OFF_AXIS_DEG)):
+        turn = turn_to_z(axis)
+        cause = f"wrong up ({'-' if axis.sum() < 0 else '+'}{'xyz'[int(np.abs(axis).argmax())]})"
+        rows = str(turn.astype(int).tolist())
+    else:
+        turn, cause = turn_to_z(up), "world not level"
+        rows = str(turn.round(4).tolist())
+    fix = f"multiply rotation and position of each camera-to-world matrix from the left by {rows}"
+    return turn, Finding("up", "fault", seen, cause, fix, sure)
+
+
+def turn_to_z(direction: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the ``(3, 3)`` smallest turn that takes a direction of length one to +z; -z turns about x."""
     z = np.array([0.0, 0.0, 1.0])
-    if axis @ z < -0.5:
+    if direction @ z < -0.9999:
         return np.diag([1.0, -1.0, -1.0])
-    v = np.cross(axis, z)
+    v = np.cross(direction, z)
     cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
-    return np.eye(3) + cross + cross @ cross / (1 + axis @ z)
+    return np.eye(3) + cross + cross @ cross / (1 + direction @ z)
 
 
 def check_volume(
