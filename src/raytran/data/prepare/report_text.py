@@ -42,7 +42,7 @@ _NOTICED = {
     "other_source_used": "scans whose best form cannot be read, another was taken",
     "damaged_images": "scans with damaged images, others were taken",
     "objects_outside_volume": "scans with objects outside the volume",
-    "objects_mirrored": "scans with mirrored objects, whose rotation is none: check=DIR tells more",
+    "objects_mirrored": "scans with mirrored objects, see check=DIR",
     "objects_flat": "scans with objects that have no thickness, taken as 1 mm thick",
 }
 
