@@ -73,7 +73,10 @@ def both(chair: CadModel, tmp_path: Path) -> tuple[Path, Path, tuple[str, str]]:
     return v2, v1, (chair.catid, chair.model_id)
 
 
-NESTS = (".", "ShapeNetCore.v2", "ShapeNetCore.v2/ShapeNetCore.v2", "ShapeNetCore", "ShapeNetCore.v1")
+NESTS = (
+    *(".", "ShapeNetCore.v2", "ShapeNetCore.v2/ShapeNetCore.v2", "ShapeNetCore", "ShapeNetCore.v1"),
+    "shapenet",
+)
 
 
 @pytest.mark.parametrize("nest", NESTS)

@@ -39,7 +39,7 @@ V2_FROM_V1 = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
 # Where the categories may lie below the folder that somebody calls ShapeNet: unpacked archives nest.
 _NESTS = (
-    *(".", "ShapeNetCore.v2", "ShapeNetCore.v2/ShapeNetCore.v2", "ShapeNetCore"),
+    *(".", "ShapeNetCore.v2", "ShapeNetCore.v2/ShapeNetCore.v2", "ShapeNetCore", "shapenet"),
     *("ShapeNetCore.v1", "ShapeNetCore.v1/ShapeNetCore.v1"),
 )
 _MESHES: tuple[tuple[str, Version], ...] = (

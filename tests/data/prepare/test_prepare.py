@@ -382,3 +382,9 @@ def test_the_real_scan_goes_through_unchanged(shared_dir, prepare, tmp_path):
     for old, new in zip(before.image_path, after.image_path, strict=True):
         assert old.read_bytes() == new.read_bytes()
     assert entries(out) == entries(real)
+
+
+def test_a_folder_without_cad_models_is_refused_before_anything_is_written(released, prepare, tmp_path):
+    with pytest.raises(DataError, match=r"no CAD model .*scannet; give the folder that holds ShapeNetCore"):
+        prepare(released, tmp_path / "out", shapenet=released / "scannet")
+    assert not (tmp_path / "out").exists()

@@ -11,7 +11,7 @@ from pathlib import Path
 from raytran.data.prepare.annotation import Annotations, find_annotations, read_usable
 from raytran.data.prepare.selection import Selection, select_scans
 from raytran.data.scan_sources import ScanSource, find_scans, read_splits
-from raytran.data.shapenet import shapenet_version
+from raytran.data.shapenet import Version, shapenet_version
 from raytran.errors import ConfigError
 
 
@@ -42,6 +42,7 @@ class Sources:
         annotation_path: the annotation file; None if there is none.
         annotations: what can be used of it.
         shapenet: folder of the CAD models.
+        version: which release of ShapeNetCore it is; None without one.
         listed: scans of each split file.
         selection: the scans to prepare.
     """
@@ -49,6 +50,7 @@ class Sources:
     annotation_path: Path | None
     annotations: Annotations | None
     shapenet: Path | None
+    version: Version | None
     listed: Mapping[str, Sequence[str]]
     selection: Selection
 
@@ -56,9 +58,7 @@ class Sources:
         jobs = self.selection.jobs
         counts = Counter(job.sources[0].form for job in jobs).most_common()
         forms = ", ".join(f"{form} {count}" for form, count in counts)
-        models = (
-            "no CAD models" if self.shapenet is None else f"ShapeNetCore {shapenet_version(self.shapenet)}"
-        )
+        models = "no CAD models" if self.version is None else f"ShapeNetCore {self.version}"
         return f"found: scans {len(jobs)} ({forms}); {models}; {self.annotation_path or 'no annotations'}"
 
 
@@ -77,6 +77,8 @@ def read_sources(released: Released, output: Path) -> Sources:
         raise ConfigError("annotations need CAD models: give shapenet=… beside scan2cad=…")
     path = None if released.scan2cad is None else find_annotations(released.scan2cad)
     annotations = None if path is None else read_usable(path)
+    shapenet = released.shapenet if path else None
+    version = None if shapenet is None else shapenet_version(shapenet)
     listed = read_splits(released.scannet)
     selection = select_scans(
         _outside(output, find_scans(released.scannet)),
@@ -86,7 +88,7 @@ def read_sources(released: Released, output: Path) -> Sources:
         scenes=released.scenes,
         splits=released.splits,
     )
-    return Sources(path, annotations, released.shapenet if path else None, listed, selection)
+    return Sources(path, annotations, shapenet, version, listed, selection)
 
 
 def _outside(output: Path, found: Mapping[str, Sequence[ScanSource]]) -> dict[str, tuple[ScanSource, ...]]:
