@@ -19,6 +19,7 @@ from scipy.spatial import ConvexHull
 
 from raytran.data.doctor.examine import Examination
 from raytran.data.doctor.recording import Recording
+from raytran.data.doctor.world import measured_up
 from raytran.data.shapenet import read_mesh
 from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
@@ -175,9 +176,12 @@ def _draw_panel(
 
 
 def _draw_up(axes: Axes, seen: Sight) -> None:
-    """Draw where the tops of the images point, in the mean, at the mean camera."""
+    """Draw where up is by the cameras, at the mean camera; nothing if they do not tell."""
     poses = seen.world_from_camera
-    up, start = -poses[:, :3, 1].mean(axis=0)[[0, 2]], poses[:, :3, 3].mean(axis=0)[[0, 2]]
+    measured, _ = measured_up(poses)
+    if measured is None:
+        return
+    up, start = measured[[0, 2]], poses[:, :3, 3].mean(axis=0)[[0, 2]]
     low, high = axes.get_ylim()
     length = 0.3 * (high - low)
     tip = float(start[1] + 1.25 * length * up[1])

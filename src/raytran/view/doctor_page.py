@@ -127,7 +127,8 @@ def _section(examination: Examination, extent: tuple[float, float, float], *, pi
         )
         if pictured:
             changes = examination.correction.changes_cameras
-            parts = [_part(examination, extent, "As stored" if changes else "Cameras and annotation", False)]
+            title = "Cameras and boxes" if len(examination.objects) else "Cameras"
+            parts = [_part(examination, extent, "As stored" if changes else title, False)]
             parts += [_part(examination, extent, "With the changes above", True)] if changes else []
     return _ScanSection(examination.scene_id, facts, examination.faults, examination.findings, parts)
 

@@ -76,24 +76,32 @@ def check_unit(depth: NDArray[np.float64], measured: NDArray[np.float64] | None)
     )
 
 
-def check_up(world_from_camera: NDArray[np.float64]) -> tuple[NDArray[np.float64] | None, Finding]:
-    """Say where up is, supposing that cameras are held level and turn about.
+def measured_up(world_from_camera: NDArray[np.float64]) -> tuple[NDArray[np.float64] | None, bool]:
+    """Return where up is, supposing that cameras are held level and turn about.
 
     The direction to which all image rows are at right angles is up, signed by the images' tops; where the
     camera hardly turns the mean of the tops alone must do, and a camera that looks down tilts it.
 
     Returns:
-        ``(3, 3)`` the turn that takes up to +z, or None if it is there or cannot be told; and the finding.
+        ``(3,)`` of length one, or None if it cannot be told; and whether the cameras turn about.
     """
     right, top = world_from_camera[:, :3, 0], -world_from_camera[:, :3, 1]
     mean = top.mean(axis=0)
     spread, axes = np.linalg.eigh(right.T @ right / len(right))
-    turns_about = spread[1] > 0.05 and spread[0] < 0.25 * spread[1]
-    if turns_about:
-        up = axes[:, 0] * np.sign(axes[:, 0] @ mean or 1.0)
-    elif np.linalg.norm(mean) > 0.5:
-        up = mean / np.linalg.norm(mean)
-    else:
+    if spread[1] > 0.05 and spread[0] < 0.25 * spread[1]:
+        return axes[:, 0] * np.sign(axes[:, 0] @ mean or 1.0), True
+    length = float(np.linalg.norm(mean))
+    return (mean / length if length > 0.5 else None), False
+
+
+def check_up(world_from_camera: NDArray[np.float64]) -> tuple[NDArray[np.float64] | None, Finding]:
+    """Say whether up is +z; see ``measured_up``.
+
+    Returns:
+        ``(3, 3)`` the turn that takes up to +z, or None if it is there or cannot be told; and the finding.
+    """
+    up, turns_about = measured_up(world_from_camera)
+    if up is None:
         return None, Finding("up", "unknown", "cameras are turned in all ways, so up cannot be told")
     off = math.degrees(math.acos(float(np.clip(up[2], -1, 1))))
     seen = f"up by the cameras is ({up[0]:+.2f}, {up[1]:+.2f}, {up[2]:+.2f}), {off:.0f}° from +z"
@@ -106,7 +114,7 @@ def check_up(world_from_camera: NDArray[np.float64]) -> tuple[NDArray[np.float64
     if off < _WRONG_DEG:
         text = f"{seen}: objects are taken to stand upright, so turn the world if it leans"
         return None, Finding("up", "note", text)
-    return _wrong_up(up, axis, seen, "certain" if turns_about and abs(up @ mean) > 0.5 else "likely")
+    return _wrong_up(up, axis, seen, "certain" if turns_about else "likely")
 
 
 def _wrong_up(up: NDArray, axis: NDArray, seen: str, sure: str) -> tuple[NDArray[np.float64], Finding]:
