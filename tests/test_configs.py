@@ -22,7 +22,9 @@ PRESETS = ("raytran", "small", "tiny")
 TRAINERS = ("auto", "cpu", "gpu", "ddp", "ddp_cpu")
 # Given by the code that instantiates the node, not by the config.
 GIVEN_BY_CODE = {
-    "raytran.data.dataset.scan2cad_dataset": {"root", "split", "num_views", "view_choice", "targets"},
+    "raytran.data.dataset.scan2cad_dataset": {
+        *("root", "split", "num_views", "view_choice", "targets", "augmentation"),
+    },
     "raytran.run.rooms.ensure_rooms": {"output"},
 }
 # Part of the layout that scan2cad_dataset stands for.

@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import zlib
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+
+from .scan_forms import INTRINSICS, encode_color, encode_sens, look_along_x, write_form
 
 CUBE_OBJ = """v -0.5 -0.5 -0.5
 v 0.5 -0.5 -0.5
@@ -33,17 +36,6 @@ f 2 3 7
 f 2 7 6
 """
 
-INTRINSICS = np.array([[40.0, 0, 24, 0], [0, 40, 16, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
-"""For images of 48×32."""
-
-
-def look_along_x(x: float) -> np.ndarray:
-    """A camera at (x, 0, 1) that looks along the world's +x, upright."""
-    pose = np.eye(4)
-    pose[:3, :3] = np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], dtype=float)
-    pose[:3, 3] = (x, 0, 1)
-    return pose
-
 
 @pytest.fixture
 def write_scan(tmp_path: Path) -> Callable[..., Path]:
@@ -57,6 +49,37 @@ def write_scan(tmp_path: Path) -> Callable[..., Path]:
             Image.new("RGB", (48, 32), (n, n, n)).save(folder / "color" / f"{n}.jpg", quality=95)
             np.savetxt(folder / "pose" / f"{n}.txt", look_along_x(n / 100))
         np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", INTRINSICS)
+        return folder
+
+    return write
+
+
+@pytest.fixture
+def write_sens(tmp_path: Path) -> Callable[..., Path]:
+    """Write a JPEG + zlib recording of the scan of ``write_scan``; frames in ``lost`` have a pose of -inf."""
+
+    def write(
+        scene_id: str = "scene0000_00", frames: int = 4, lost: Sequence[int] = (), root: Path = tmp_path
+    ) -> Path:
+        path = root / "scannet" / "scans" / scene_id / f"{scene_id}.sens"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        color = [encode_color(np.full((32, 48, 3), n, np.uint8), "jpeg") for n in range(frames)]
+        depth = [zlib.compress(np.full((6, 8), 1000 + n, "<u2").tobytes()) for n in range(frames)]
+        poses = np.array([look_along_x(n / 100) for n in range(frames)]).reshape(-1, 4, 4)
+        poses[list(lost)] = -np.inf
+        path.write_bytes(encode_sens(color, depth, poses))
+        return path
+
+    return write
+
+
+@pytest.fixture
+def scan_in_form(write_scan, tmp_path: Path) -> Callable[..., Path]:
+    """Write the scan of ``write_scan`` to a folder in one of the exported forms."""
+
+    def write(form: str, folder: Path, frames: Sequence[int] = (0, 10, 20, 100)) -> Path:
+        plain = tmp_path / f"plain-{folder.parent.name}-{form}"
+        write_form(form, write_scan(folder.name, frames, root=plain), folder)
         return folder
 
     return write

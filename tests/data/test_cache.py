@@ -47,6 +47,22 @@ def test_entry_of_another_size_counts_as_missing(tmp_path) -> None:
     assert cache.read("shape", "ab12", (70, 9)) is None
 
 
+def test_a_stack_names_what_is_missing_or_damaged(tmp_path) -> None:
+    cache = MaskCache(folder=tmp_path)
+    cache.write("foreground", "aa", MASK)
+    cache.write("foreground", "bb", ~MASK)
+    cache.write("foreground", "dd", MASK[:2])
+    cache.write("foreground", "ee", MASK[:1, :1])
+    arrays, missing = cache.read_stack("foreground", ["bb", "cc", "aa", "dd", "ee"], (7, 9))
+    assert missing == [1, 3, 4]
+    np.testing.assert_array_equal(arrays[[0, 2]], [~MASK, MASK])
+    assert not arrays[missing].any()
+    assert arrays.dtype == bool
+    none, missing = cache.read_stack("foreground", [], (7, 9))
+    assert none.shape == (0, 7, 9)
+    assert missing == []
+
+
 def write_often(folder: Path) -> None:
     for _ in range(50):
         MaskCache(folder=folder).write("shape", "ab12", MASK)

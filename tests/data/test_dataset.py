@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import io
 import pickle
 import shutil
 
@@ -10,10 +11,13 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
+from raytran.data import dataset as dataset_module
+from raytran.data.augment import Augmentation
 from raytran.data.collate import collate_scenes
 from raytran.data.dataset import SceneDataset, scan2cad_dataset
 from raytran.data.scannet import load_views
 from raytran.errors import ConfigError, DataError
+from raytran.geometry.rotation import yaw_from_rotation
 from raytran.types import SHAPE_SIZE
 
 SMALL = {"image_size": (32, 48), "num_views": 2, "grid_resolution": (8, 8, 4), "grid_extent": (8.0, 8.0, 4.0)}
@@ -119,10 +123,106 @@ def test_workers_give_what_the_process_itself_gives_in_every_epoch(long_dataset)
     assert len(set(seen)) == 3
 
 
+ALL = Augmentation(yaw_deg=180, shift=(0.5, 0.5, 0.2), mirror=0.5, brightness=0.2, frame_dropout=0.3)
+
+
+def test_augmentation_depends_on_seed_epoch_and_index_alone(long_dataset) -> None:
+    def sample(seed=0, epoch=0, index=0):
+        dataset = open_dataset(long_dataset, num_views=6, augmentation=ALL, seed=seed)
+        dataset.set_epoch(epoch)
+        return dataset[index]
+
+    def state(sample):
+        return [sample.views.images, sample.views.world_from_camera, sample.grid_center, sample.occupancy]
+
+    assert all(map(torch.equal, state(sample()), state(sample())))
+    yaws = [
+        float(yaw_from_rotation(sample(**change).objects[0].rotation)[0])
+        for change in ({}, {"seed": 1}, {"epoch": 1}, {"index": 1})
+    ]
+    assert len(set(yaws)) == 4
+
+
+def test_augmented_workers_give_what_the_process_itself_gives(long_dataset) -> None:
+    dataset = open_dataset(long_dataset, num_views=6, augmentation=ALL)
+    dataset.set_epoch(3)
+    (batch,) = DataLoader(dataset, batch_size=2, num_workers=1, collate_fn=collate_scenes)
+    expected = collate_scenes([dataset[0], dataset[1]])
+    assert torch.equal(batch.views.images, expected.views.images)
+    assert torch.equal(batch.views.world_from_camera, expected.views.world_from_camera)
+    assert torch.equal(batch.occupancy, expected.occupancy)
+
+
+def test_augmentation_that_is_off_is_none(long_dataset) -> None:
+    plain = open_dataset(long_dataset, num_views=6)[1]
+    off = open_dataset(long_dataset, num_views=6, augmentation=Augmentation())[1]
+    assert plain.frame_id == off.frame_id
+    assert torch.equal(plain.views.images, off.views.images)
+    assert torch.equal(plain.occupancy, off.occupancy)
+
+
+def test_augmentation_changes_neither_the_frames_drawn_nor_the_cached_masks(cube_dataset) -> None:
+    plain = open_dataset(cube_dataset, view_choice="even")[0]
+    entries = {path: path.stat().st_mtime_ns for path in (cube_dataset / "cache").rglob("*.z")}
+    dataset = open_dataset(
+        cube_dataset, view_choice="even", augmentation=Augmentation(mirror=1.0, yaw_deg=180)
+    )
+    for epoch in range(3):
+        dataset.set_epoch(epoch)
+        sample = dataset[0]
+        assert sample.frame_id == plain.frame_id
+        assert torch.equal(sample.foreground, plain.foreground.flip(-1))
+        assert sample.occupancy.any()
+    assert {path: path.stat().st_mtime_ns for path in (cube_dataset / "cache").rglob("*.z")} == entries
+
+
+def test_dropout_keeps_the_number_of_images(cube_dataset) -> None:
+    dropping = Augmentation(frame_dropout=1.0)
+    sample = open_dataset(cube_dataset, num_views=4, min_views=3, augmentation=dropping)[0]
+    assert sample.views.images.shape[1] == 4
+    assert len(set(sample.frame_id[0])) == 3
+
+
 def test_dataset_can_be_pickled(long_dataset) -> None:
     dataset = open_dataset(long_dataset, num_views=6, targets=())
     dataset.set_epoch(5)
     assert pickle.loads(pickle.dumps(dataset))[0].frame_id == dataset[0].frame_id
+
+
+def test_annotation_is_read_once(long_dataset, monkeypatch) -> None:
+    read = []
+    real = dataset_module.read_annotations
+    monkeypatch.setattr(dataset_module, "read_annotations", lambda path: read.append(path) or real(path))
+    (long_dataset / "scannet" / "scannetv2_train.txt").write_text("scene0001_00\n")
+    open_dataset(long_dataset)
+    assert len(read) == 1
+
+
+def test_dataset_holds_few_tensors_however_many_scenes(long_dataset, write_annotations, cube_entry) -> None:
+    """A worker process that is not forked gets each tensor by a file handle of its own."""
+    scans = long_dataset / "scannet" / "scans"
+    names = [f"scene{i:04d}_00" for i in range(300)]
+    for name in names[2:]:
+        (scans / name).symlink_to(scans / names[0])
+    write_annotations({name: [cube_entry()] for name in names})
+    dataset = open_dataset(long_dataset, num_views=6)
+    for i in range(20):
+        dataset[i]
+    assert len(dataset) == 300
+    tensors = []
+
+    class Pickler(pickle.Pickler):
+        def reducer_override(self, value):
+            tensors.extend([value] if isinstance(value, torch.Tensor) else [])
+            return NotImplemented
+
+    content = io.BytesIO()
+    Pickler(content).dump(dataset)
+    assert len(tensors) < 10
+    assert len(content.getvalue()) < 100_000
+    copy = pickle.loads(content.getvalue())
+    assert copy[299].scene_id == (names[299],)
+    assert copy[299].frame_id == dataset[299].frame_id
 
 
 def test_scan_with_too_few_frames_repeats_them(cube_dataset) -> None:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from raytran.data.images import read_image, read_images, stored_size
+from raytran.data.images import decode_image, read_image, read_images, resize, stored_size
 from raytran.errors import DataError
 
 
@@ -65,6 +65,31 @@ def test_grey_and_alpha_become_rgb(tmp_path) -> None:
     Image.new("RGBA", (4, 4), (1, 2, 3, 4)).save(tmp_path / "alpha.png")
     assert read_image(tmp_path / "grey.jpg", (4, 4))[:, 0, 0].tolist() == [70, 70, 70]
     assert read_image(tmp_path / "alpha.png", (4, 4))[:, 0, 0].tolist() == [1, 2, 3]
+
+
+def test_an_image_in_memory_is_read_as_its_file(paths) -> None:
+    content = paths[3].read_bytes()
+    assert torch.equal(decode_image(content, name="a"), read_image(paths[3], (8, 16)))
+    assert torch.equal(decode_image(content, name="a", image_size=(4, 4)), read_image(paths[3], (4, 4)))
+    with pytest.raises(DataError, match="cannot read the image frame 7"):
+        decode_image(content[:-40], name="frame 7")
+    with pytest.raises(DataError, match="frame 7 is 16x8, not 48x32"):
+        decode_image(content, name="frame 7", stored=(32, 48))
+
+
+def test_pixels_are_resized_as_images_are(tmp_path) -> None:
+    pixels = np.random.default_rng(0).integers(256, size=(12, 18, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    expected = read_image(tmp_path / "a.png", (5, 7)).permute(1, 2, 0)
+    np.testing.assert_array_equal(resize(pixels, (5, 7)), expected)
+
+
+def test_an_image_that_claims_gigapixels_is_refused(paths) -> None:
+    """The size in a JPEG's start-of-frame segment is changed to 65535×65535."""
+    content = paths[0].read_bytes()
+    at = content.index(b"\xff\xc0") + 5
+    with pytest.raises(DataError, match="cannot read the image bomb"):
+        decode_image(content[:at] + b"\xff" * 4 + content[at + 4 :], name="bomb")
 
 
 def test_truncated_image_and_wrong_size_name_the_file(paths) -> None:

@@ -101,7 +101,7 @@ def test_files_that_cannot_be_used(tmp_path, write_annotations, cube_entry) -> N
     with pytest.raises(DataError, match="not valid JSON"):
         read_annotations(broken)
     broken.write_text('{"scene": 1}')
-    with pytest.raises(DataError, match="entry 0"):
+    with pytest.raises(DataError, match="not a list of scenes"):
         read_annotations(broken)
     for entry in (
         cube_entry(sym="mirror"),

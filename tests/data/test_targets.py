@@ -9,12 +9,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+import trimesh
 from PIL import Image
+from scipy.ndimage import binary_dilation, gaussian_filter
+from scipy.spatial.transform import Rotation
 
+from raytran.data import targets
 from raytran.data.cache import MaskCache
 from raytran.data.scan2cad import read_annotations, scene_objects
 from raytran.data.scannet import read_scan
+from raytran.data.shapenet import read_mesh
+from raytran.data.shapenet_binvox import read_binvox
 from raytran.data.targets import foreground_masks, scene_occupancy, shape_grids
+from raytran.data.voxelize import voxelize_solid
 from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
@@ -84,6 +91,83 @@ class TestOccupancy:
         assert not scene_occupancy(none, small).any()
         assert scene_occupancy(ObjectSet.empty(), small).shape == (2, 2, 2)
 
+    @pytest.mark.parametrize("seed", range(24))
+    def test_the_same_as_all_points_of_all_cells(self, seed) -> None:
+        rng = np.random.default_rng(seed)
+        noise = gaussian_filter(rng.normal(size=(SHAPE_SIZE,) * 3), rng.uniform(0.5, 8))
+        shape = noise > np.quantile(noise, rng.choice([0.0005, 0.2, 0.6, 0.95]))
+        turn = Rotation.random(random_state=seed) if seed % 2 else Rotation.from_euler("z", seed)
+        objects = replace(
+            box(tuple(rng.uniform(-1, 1, 3)), tuple(rng.uniform(0.1, 3.5, 3))),
+            rotation=torch.tensor(turn.as_matrix()[None]),
+            shape=torch.from_numpy(shape[None]),
+        )
+        coarse, fine = ((48, 48, 16), (9.0, 9.0, 3.5)), ((60, 50, 40), (3.0, 4.0, 2.0))
+        volume = grid(*(fine if seed % 3 == 0 else coarse))
+        expected = occupancy_of_all_points(objects, volume)
+        assert expected.any()
+        assert not expected.all()
+        assert torch.equal(scene_occupancy(objects, volume), torch.from_numpy(expected))
+
+    def test_inner_cells_are_passed_over(self) -> None:
+        """A solid of 63³ cells is known by its hull and a few points inside."""
+        shape = np.ones((SHAPE_SIZE,) * 3, dtype=bool)
+        chosen = targets._enough_cells(shape, np.full(3, 0.05))
+        assert 63**3 - 61**3 < chosen.sum() < 0.12 * chosen.size
+
+    def test_a_flat_object_and_a_single_solid_cell(self) -> None:
+        shape = torch.zeros(1, *[SHAPE_SIZE] * 3, dtype=torch.bool)
+        shape[0, 31, 31, 31] = True
+        objects = replace(box((0.1, 0.1, 0.1), (0.4, 0.0, 0.4)), shape=shape)
+        assert scene_occupancy(objects, grid((4, 4, 4), (4.0, 4.0, 4.0))).nonzero().tolist() == [[2, 2, 2]]
+
+    @pytest.mark.parametrize("side", [1e3, 1e9, math.inf, math.nan])
+    def test_an_object_in_another_unit_is_named(self, side) -> None:
+        objects = box((0.0, 0.0, 0.0), (0.5, side, 0.5))
+        objects.shape[0, 1:] = False
+        with pytest.raises(DataError, match=r"0\.5 × .* × 0\.5 m is too large .*unit"):
+            scene_occupancy(objects, grid((48, 48, 16), (1e-3, 1e-3, 1e-3)))
+
+    def test_a_real_scene_agrees_with_the_voxels_of_shapenet(self, shared_dir, tmp_path) -> None:
+        """Occupancy of the scene from our shapes and from ShapeNet's own solid voxels."""
+        root = shared_dir / "realdata" / "scene0470_00"
+        objects = scene_objects(read_annotations(root / "scan2cad" / "full_annotations.json")["scene0470_00"])
+        cache = MaskCache(folder=tmp_path)
+        ours = shape_grids(objects.model_id, shapenet_root=root / "shapenet", cache=cache)
+        volume = grid((48, 48, 16), (9.0, 9.0, 3.5), center=tuple(objects.center.mean(dim=0).tolist()))
+        occupied = scene_occupancy(replace(objects, shape=ours), volume).numpy()
+        expected = np.zeros_like(occupied)
+        for m, model_id in enumerate(objects.model_id):
+            folder = root / "shapenet" / model_id / "models"
+            mesh = read_mesh(root / "shapenet", *model_id.split("/"))
+            cells, translate, scale = read_binvox(folder / "model_normalized.solid.binvox")
+            points = translate + (np.argwhere(cells) + 0.5) / len(cells) * scale
+            local = (points - mesh.bounds.mean(axis=0)) / mesh.extents * objects.size[m].numpy()
+            world = local @ objects.rotation[m].numpy().T + objects.center[m].numpy()
+            index = np.floor((world - volume.lower.numpy()) / volume.voxel_size.numpy()).astype(int)
+            expected[tuple(index.T)] = True
+        assert (occupied & expected).sum() / (occupied | expected).sum() >= 0.9
+        around = np.ones((3, 3, 3))
+        assert not (occupied & ~binary_dilation(expected, around)).any()
+        assert not (expected & ~binary_dilation(occupied, around)).any()
+
+
+def occupancy_of_all_points(objects: ObjectSet, volume: VoxelGrid) -> np.ndarray:
+    """The obvious twin: every solid cell filled with points at most half a voxel apart."""
+    voxel, lower = volume.voxel_size.double().numpy(), volume.lower.double().numpy()
+    occupied = np.zeros(volume.resolution, dtype=bool)
+    for m, shape in enumerate(objects.shape.numpy()):
+        size, rotation, center = (
+            t[m].double().numpy() for t in (objects.size, objects.rotation, objects.center)
+        )
+        cell = size / len(shape)
+        parts = np.ceil(cell / voxel.min() * 2).astype(int)
+        inner = np.stack(np.meshgrid(*((np.arange(n) + 0.5) / n for n in parts), indexing="ij"), axis=-1)
+        points = (np.argwhere(shape)[:, None] + inner.reshape(-1, 3)).reshape(-1, 3) * cell - size / 2
+        index = np.floor((points @ rotation.T + center - lower) / voxel).astype(int)
+        occupied[tuple(index[((index >= 0) & (index < volume.resolution)).all(axis=1)].T)] = True
+    return occupied
+
 
 class TestShapes:
     def test_cube_is_full_and_kept(self, write_cube, tmp_path) -> None:
@@ -108,6 +192,36 @@ class TestShapes:
         changed = shape_grids(("03001627/cube",), **options)
         assert not changed.all()
         assert changed.any()
+
+    def test_known_and_new_models_together(self, write_cube, tmp_path, monkeypatch) -> None:
+        path = write_cube(model_id="corner")
+        path.write_text(path.read_text().replace("v 0.5 0.5 0.5", "v 0.9 0.9 0.9"))
+        write_cube()
+        options = {"shapenet_root": tmp_path / "shapenet", "cache": MaskCache(folder=tmp_path / "cache")}
+        (corner,) = shape_grids(("03001627/corner",), **options)
+        made = []
+        monkeypatch.setattr(
+            targets, "voxelize_solid", lambda *mesh, size: made.append(1) or voxelize_solid(*mesh, size=size)
+        )
+        names = ("03001627/cube", "03001627/corner", "03001627/cube")
+        shapes = shape_grids(names, **options)
+        assert made == [1]
+        assert torch.equal(shapes[1], corner)
+        assert shapes[[0, 2]].all()
+        assert torch.equal(shape_grids(names, **options), shapes)
+        assert made == [1]
+
+    def test_a_model_of_the_first_release(self, tmp_path) -> None:
+        # A stair whose low step is in front: +X in v1, hence low z in a grid.
+        folder = tmp_path / "ShapeNetCore.v1" / "03001627" / "stair"
+        folder.mkdir(parents=True)
+        high = trimesh.creation.box(bounds=[(-0.5, 0, -0.3), (0, 0.4, 0.3)])
+        low = trimesh.creation.box(bounds=[(0, 0, -0.3), (0.5, 0.1, 0.3)])
+        (folder / "model.obj").write_text(trimesh.util.concatenate([high, low]).export(file_type="obj"))
+        (grid,) = shape_grids(("03001627/stair",), shapenet_root=tmp_path, cache=MaskCache(folder=tmp_path))
+        assert not grid[:, 17:, :31].any()
+        assert grid[:, :, 32:].all()
+        assert grid[:, :15].all()
 
     def test_missing_model(self, tmp_path) -> None:
         cache = MaskCache(folder=tmp_path / "cache")

@@ -46,6 +46,7 @@ def settings(rooms):
         "trainer.val_check_interval=2",
         "schedule.log_every=1",
         "checkpoint_every=2",
+        "check_parent=false",
     ]
 
 

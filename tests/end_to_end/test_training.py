@@ -50,7 +50,8 @@ def test_a_curriculum_trains_three_stages(trained):
         ("shape", "tiny", 4),
     ]
     cards = [torch.load(fit.checkpoint, weights_only=True) for fit in fits]
-    assert [card["parent"] for card in cards] == [None, str(fits[0].checkpoint), str(fits[1].checkpoint)]
+    assert cards[0]["parent"] is None
+    assert [card["parent"]["path"] for card in cards[1:]] == [str(fit.checkpoint) for fit in fits[:2]]
     assert read_finished(folder).stage == "curriculum"
 
 
@@ -90,7 +91,7 @@ def test_a_killed_curriculum_goes_on_where_it_was(trained, settings, tmp_path):
     assert [read_finished(fit.folder).steps for fit in fits] == [4, 4, 4]
     # Stage 2 had taken its four steps: resumed, it logs no further one.
     assert len(read_history(fits[1].folder)["train/total"]) == 4
-    assert torch.load(fits[2].checkpoint, weights_only=True)["parent"] == str(fits[1].checkpoint)
+    assert torch.load(fits[2].checkpoint, weights_only=True)["parent"]["path"] == str(fits[1].checkpoint)
 
 
 def test_curves_can_be_read(trained):
@@ -148,7 +149,7 @@ def test_init_from_auto_takes_the_newest_parent(settings, trained, tmp_path):
         fit(settings, outputs / "tiny" / "stage2" / "a", "experiment=stage2", f"outputs={outputs}")
     parent = fit(settings, outputs / "tiny" / "stage1" / "a", f"outputs={outputs}")
     child = fit(settings, outputs / "tiny" / "stage2" / "b", "experiment=stage2", f"outputs={outputs}")
-    assert torch.load(child.checkpoint, weights_only=True)["parent"] == str(parent.checkpoint)
+    assert torch.load(child.checkpoint, weights_only=True)["parent"]["path"] == str(parent.checkpoint)
 
 
 def test_a_missing_parent_is_one_sentence(settings, tmp_path):
@@ -199,14 +200,14 @@ def test_a_stopped_run_goes_on(stop, code, settings, tmp_path, command):
         env=os.environ | {"OMP_NUM_THREADS": "1"},
     ) as process:
         deadline = time.monotonic() + 120
-        while not (log := next(tmp_path.glob("outputs/tiny/stage1/*/logs/version_0"), None)):
+        while not (log := next(tmp_path.glob("outputs/tiny/stage1/*/metrics.csv"), None)):
             assert process.poll() is None
             assert time.monotonic() < deadline
             time.sleep(0.1)
         time.sleep(3)
         process.send_signal(stop)
         assert process.wait(timeout=60) == code
-    run = log.parent.parent
+    run = log.parent
     step = torch.load(run / LAST, weights_only=True)["global_step"]
     assert 0 < step < 400
     last = f"trainer.max_steps={step + 2}"
@@ -231,5 +232,5 @@ def test_two_processes_train_together(settings, trained, tmp_path, command):
     assert done.returncode == 0, done.stderr
     assert read_finished(run).steps == 4
     assert not any(tmp_path.glob("outputs/**/last.ckpt"))
-    # Two rooms on two ranks are one step an epoch: the fourth step is in epoch 3, on one rank in epoch 1.
-    assert torch.load(run / LAST, weights_only=True)["epoch"] == 3
+    # Four steps of two scenes on each of two ranks.
+    assert torch.load(run / LAST, weights_only=True)["SceneDataModule"] == {"scenes": 16, "step": 4}

@@ -49,6 +49,14 @@ def test_commands_find_their_configs(site: Path, tmp_path: Path, command: str) -
     assert list(tmp_path.iterdir()) == []
 
 
+def test_sweeps_find_their_launcher(site: Path, tmp_path: Path) -> None:
+    shown = run(site, tmp_path, "-m", "raytran.train", "--info", "plugins")
+    assert shown.returncode == 0, shown.stderr
+    assert "ProcessLauncher" in shown.stdout
+    where = run(site, tmp_path, "-c", "import hydra_plugins.raytran_launcher as p; print(p.__file__)")
+    assert where.stdout.strip() == str(site / "hydra_plugins" / "raytran_launcher" / "__init__.py")
+
+
 def test_rooms_are_made_where_the_user_is(site: Path, tmp_path: Path) -> None:
     words = ["-m", "raytran.prepare", "dataset=rooms", "output=rooms", "preset=tiny", "processes=1"]
     small = ["num_train=1", "num_val=1", "frames=3", "image_size=[48,64]", "max_objects=3"]

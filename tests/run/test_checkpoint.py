@@ -24,13 +24,8 @@ def config():
 def saved(config, tmp_path):
     """A checkpoint as training writes it, and the model in it."""
     model = build_model(config)
-    card = checkpoint_card(
-        stage="joint",
-        preset="tiny",
-        model=plain(config.model),
-        views=plain(config.views),
-        parent="stage1.ckpt",
-    )
+    parent = {"path": "stage1.ckpt", "stage": "occupancy", "step": 3, "scores": {}}
+    card = checkpoint_card(stage="joint", preset="tiny", config=plain(config), parent=parent)
     state = {f"model.{name}": value for name, value in model.state_dict().items()}
     path = tmp_path / "last.ckpt"
     write_checkpoint(path, {**card, "state_dict": state})
@@ -49,7 +44,11 @@ def test_load_rebuilds_the_model(saved):
 def test_the_card_is_complete(saved):
     content = torch.load(saved[0], weights_only=True)
     assert content["format"] == "raytran.checkpoint/1"
-    assert (content["stage"], content["preset"], content["parent"]) == ("joint", "tiny", "stage1.ckpt")
+    assert (content["stage"], content["preset"], content["parent"]["path"]) == (
+        "joint",
+        "tiny",
+        "stage1.ckpt",
+    )
     assert content["model"]["_target_"] == "raytran.model.RayTran"
     assert content["versions"]["torch"] == torch.__version__
     assert content["git_commit"] is None or len(content["git_commit"].split("+")[0]) == 40
@@ -75,12 +74,23 @@ def test_weights_of_another_model_are_one_sentence(saved):
         load_weights(other, content, saved[0])
 
 
+@pytest.mark.parametrize(
+    ("key", "value"), [("image_size", 5), ("image_size", ["a", "b"]), ("predict_views", None)]
+)
+def test_settings_that_are_none_are_one_sentence(saved, key, value):
+    content = torch.load(saved[0], weights_only=True)
+    content["views"][key] = value
+    write_checkpoint(saved[0], content)
+    with pytest.raises(CheckpointError, match="which images"):
+        prediction_settings(saved[0])
+
+
 def test_a_checkpoint_cannot_run_foreign_code(saved):
     path = saved[0]
     content = torch.load(path, weights_only=True)
     content["model"]["backbone"]["resnet"] = {"_target_": "os.system", "command": "true"}
     write_checkpoint(path, content)
-    with pytest.raises(CheckpointError, match=r"os\.system"):
+    with pytest.raises(CheckpointError, match=r"last\.ckpt asks to run 'os\.system'"):
         raytran.load(path)
 
 

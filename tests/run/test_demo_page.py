@@ -75,10 +75,10 @@ def test_headline():
 
 @pytest.fixture
 def page(tmp_path) -> str:
-    logs = tmp_path / "training" / "stage1" / "logs" / "version_0"
+    logs = tmp_path / "training" / "stage1"
     logs.mkdir(parents=True)
     (logs / "metrics.csv").write_text("epoch,step,train/total\n0,1,2.0\n0,2,1.0\n")
-    fit = FitResult(logs.parents[1], logs.parents[1] / "checkpoints" / "last.ckpt", 2, 1.0, {})
+    fit = FitResult(logs, logs / "checkpoints" / "last.ckpt", 2, 1.0, {})
     path = write_page(
         tmp_path,
         scenes=[scene("train", "scene0000_00", tmp_path), scene("val", "scene0001_00", tmp_path)],

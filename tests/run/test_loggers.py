@@ -2,25 +2,16 @@
 from __future__ import annotations
 
 import pytest
-from lightning.pytorch.loggers import CSVLogger
 
-from raytran.run.loggers import LOGS, read_history, tensorboard_logger, wandb_logger
-
-
-def write_log(folder, entries):
-    logger = CSVLogger(save_dir=folder, name=LOGS)
-    for step, metrics in entries:
-        logger.log_metrics(metrics, step=step)
-    logger.save()
+from raytran.run.loggers import METRICS, read_history, tensorboard_logger, wandb_logger
+from raytran.training.metrics_table import MetricsTable
 
 
-def test_a_resumed_run_continues_its_curves(tmp_path):
-    write_log(tmp_path, [(0, {"train/total": 5.0}), (10, {"train/total": 4.0}), (20, {"train/total": 3.0})])
-    # Stopped after step 20, resumed from the checkpoint of step 10.
-    write_log(tmp_path, [(20, {"train/total": 2.5}), (30, {"train/total": 2.0, "val/total": 7.0})])
-    history = read_history(tmp_path)
-    assert history["train/total"] == [(0, 5.0), (10, 4.0), (20, 2.5), (30, 2.0)]
-    assert history["val/total"] == [(30, 7.0)]
+def test_a_run_logs_where_its_history_is_read(tmp_path):
+    table = MetricsTable(tmp_path / METRICS)
+    table.log_metrics({"train/total": 5.0}, step=0)
+    table.save()
+    assert read_history(tmp_path) == {"train/total": [(0, 5.0)]}
 
 
 def test_no_log_is_an_empty_history(tmp_path):

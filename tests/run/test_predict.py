@@ -18,6 +18,8 @@ from raytran.run import predict as module
 from raytran.run.checkpoint import PredictionSettings
 from raytran.types import ObjectSet, ScenePrediction, Views
 
+from ..data.scan_forms import encode_sens, write_form
+
 IMAGE_SIZE = (48, 64)
 UPRIGHT = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
@@ -117,6 +119,27 @@ def test_views_follow_the_checkpoint_and_come_once(scene, oracle, tmp_path):
     assert oracle.seen.world_from_camera[0, :, 0, 3].tolist() == pytest.approx([0.0, 0.1, 0.3, 0.4])
     module.predict(config(scene, tmp_path / "out", num_views=2))
     assert oracle.seen.images.shape[1] == 2
+
+
+@pytest.mark.parametrize("form", ["cpp", "odam", "mmdetection3d", "frames_25k", "sens"])
+def test_every_form_of_a_scan_gives_the_same_views(scene, oracle, tmp_path, form):
+    module.predict(config(scene, tmp_path / "expected"))
+    expected = oracle.seen
+    other = tmp_path / "other" / "living_room"
+    if form == "sens":
+        other = other.with_suffix(".sens")
+        other.parent.mkdir()
+        color = [(scene / "color" / f"{5 * n}.jpg").read_bytes() for n in range(5)]
+        poses = np.stack([np.loadtxt(scene / "pose" / f"{5 * n}.txt") for n in range(5)])
+        matrix = np.loadtxt(scene / "intrinsic" / "intrinsic_color.txt")
+        other.write_bytes(encode_sens(color, [b""] * 5, poses, color_size=(60, 80), intrinsics=matrix))
+    else:
+        write_form(form, scene, other)
+    output = module.predict(config(other, tmp_path / "out"))
+    assert json.loads((output / "scene.json").read_text())["scene_id"] == "living_room"
+    assert torch.equal(oracle.seen.images, expected.images)
+    assert torch.equal(oracle.seen.intrinsics, expected.intrinsics)
+    torch.testing.assert_close(oracle.seen.world_from_camera, expected.world_from_camera, rtol=0, atol=1e-6)
 
 
 def test_thresholds(scene, oracle, tmp_path):

@@ -1,9 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-from collections import Counter
+from itertools import islice
+from types import SimpleNamespace
 
-from raytran.training.datamodule import EpochSampler, SceneDataModule
+import pytest
+import torch
+
+from raytran.data.augment import Augmentation
+from raytran.run.build import build_data
+from raytran.run.entry import compose
+from raytran.training.datamodule import SceneDataModule
 
 
 class Scenes:
@@ -32,14 +39,30 @@ def make_data(monkeypatch, tmp_path, **options):
 
 def test_every_epoch_brings_every_scene_in_another_order(monkeypatch, tmp_path):
     loader = make_data(monkeypatch, tmp_path).train_dataloader()
-    orders = []
-    for epoch in range(3):
-        loader.sampler.set_epoch(epoch)
-        items = [item for batch in loader for item in batch]
-        assert {found for found, _ in items} == {epoch}
-        orders.append([index for _, index in items])
-    assert all(sorted(order) == [0, 1, 2, 3, 4] for order in orders)
-    assert len({tuple(order) for order in orders}) > 1
+    items = [item for batch in islice(loader, 15) for item in batch]
+    orders = [items[5 * epoch : 5 * epoch + 5] for epoch in range(3)]
+    for epoch, order in enumerate(orders):
+        assert {found for found, _ in order} == {epoch}
+        assert sorted(index for _, index in order) == [0, 1, 2, 3, 4]
+    assert len({tuple(index for _, index in order) for order in orders}) > 1
+
+
+def test_a_checkpoint_holds_the_place_in_the_stream(monkeypatch, tmp_path):
+    whole = list(islice(make_data(monkeypatch, tmp_path, batch_size=2).train_dataloader(), 9))
+    # Stopped after three steps of two batches on one rank, it goes on with the seventh batch.
+    stopped, resumed = (make_data(monkeypatch, tmp_path, batch_size=2) for _ in range(2))
+    stopped.trainer = SimpleNamespace(global_step=3, accumulate_grad_batches=2, world_size=1)
+    assert stopped.state_dict() == {"scenes": 12, "step": 3}
+    resumed.load_state_dict(stopped.state_dict())
+    assert list(islice(resumed.train_dataloader(), 3)) == whole[6:]
+
+
+def test_loaders_leave_the_random_numbers_of_the_run_alone(monkeypatch, tmp_path):
+    data = make_data(monkeypatch, tmp_path)
+    before = torch.get_rng_state()
+    next(iter(data.train_dataloader()))
+    next(iter(data.val_dataloader()))
+    assert torch.equal(torch.get_rng_state(), before)
 
 
 def test_training_draws_views_and_validation_spreads_them(monkeypatch, tmp_path):
@@ -49,12 +72,19 @@ def test_training_draws_views_and_validation_spreads_them(monkeypatch, tmp_path)
     assert (validation["split"], validation["view_choice"], validation["num_views"]) == ("val", "even", 9)
 
 
-def test_ranks_share_the_scenes():
-    parts = [list(EpochSampler(Scenes(), num_replicas=2, rank=rank)) for rank in range(2)]
-    counts = Counter(index for part in parts for _, index in part)
-    # Six places for five scenes: one comes twice so that both ranks take the same number of steps.
-    assert sorted(counts) == [0, 1, 2, 3, 4]
-    assert sum(counts.values()) == 6
+def test_only_training_scenes_are_augmented(monkeypatch, tmp_path):
+    data = make_data(monkeypatch, tmp_path, augmentation=Augmentation(mirror=1.0))
+    assert data.split("train", training=True).options["augmentation"].mirror == 1
+    assert data.split("train").options["augmentation"] is None
+    assert data.split("val").options["augmentation"] is None
+
+
+@pytest.mark.parametrize("data", ["rooms", "scan2cad"])
+def test_augmentation_is_off_unless_asked_for(data):
+    overrides = ["preset=raytran", f"data={data}", "data.root=unused", "output_dir=unused"]
+    assert build_data(compose("train", overrides))._augmentation == Augmentation()
+    asked = build_data(compose("train", [*overrides, "data.augmentation.shift=[0.5,0.5,0.2]"]))
+    assert asked._augmentation == Augmentation(shift=(0.5, 0.5, 0.2))
 
 
 def test_data_are_made_where_they_are_read(monkeypatch, tmp_path):

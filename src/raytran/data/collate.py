@@ -25,6 +25,9 @@ def collate_scenes(samples: Sequence[SceneBatch]) -> SceneBatch:
     shapes = {tuple(sample.views.images.shape[1:]) for sample in samples}
     if len(shapes) > 1:
         raise ShapeError(f"expected scenes with images of one number and size, got {sorted(shapes)}")
+    if len(samples) == 1:
+        # Spares a copy of all images.
+        return samples[0]
     objects = [sample.objects for sample in samples]
     return SceneBatch(
         scene_id=tuple(chain.from_iterable(sample.scene_id for sample in samples)),

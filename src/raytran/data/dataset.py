@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -13,32 +13,42 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from raytran.data.augment import Augmentation
 from raytran.data.cache import MaskCache
 from raytran.data.images import MIN_VIEWS
 from raytran.data.scan2cad import SceneAnnotation, read_annotations, scene_objects
-from raytran.data.scannet import Scan, read_scan, scan_views
+from raytran.data.scannet import Scan, scan_views
+from raytran.data.scene_list import ObjectTable, RecentScans, annotated, choose_scenes, read_split
 from raytran.data.targets import foreground_masks, scene_occupancy, shape_grids
 from raytran.data.views import choose_even, choose_random
 from raytran.errors import ConfigError, DataError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.types import ObjectSet, SceneBatch
+from raytran.types import ObjectSet, SceneBatch, Views
 
 TARGETS: tuple[str, ...] = ("objects", "shapes", "occupancy", "foreground")
 """Targets a data set can give; "shapes" gives the objects too."""
+
+_MEMORY_OF_SCANS = 64 * 2**20
+"""Bytes in which each process keeps cameras and file names: 300,000 frames, all of ScanNet at 200 a scan."""
+
+_DROPOUT, _AUGMENTATION = 1, 2
+"""What randomness is for, besides the choice of frames."""
 
 
 class SceneDataset(Dataset[SceneBatch]):
     """Scans with their annotation; item i is a ``SceneBatch`` with B = 1.
 
-    Nothing but the annotation is read before an item is asked for, and targets are kept on disk, so a data
-    set is small to send to the workers of a ``DataLoader``. Random frames depend on the seed, the epoch and
-    the index alone.
+    Nothing but the annotation is read before an item is asked for; targets are kept on disk, and in memory
+    the cameras of the latest scans. So a data set is small, stays small, and is quick to send to the workers
+    of a ``DataLoader``. Random frames and augmentation depend on the seed, the epoch and the index alone.
+    A scan of fewer than N frames gives some of them more than once, so all scenes have N images.
 
     Args:
         scans_root: folder of the scans, ``…/scannet/scans``.
         scene_ids: scans to take; if None all in ``scans_root`` that have objects in the annotation, if given.
-        annotations: Scan2CAD's ``full_annotations.json``; may be None if there are no targets.
+        annotations: Scan2CAD's ``full_annotations.json``, or what ``read_annotations`` made of it; may be
+            None if there are no targets.
         shapenet_root: folder of ShapeNet's categories; needed for all targets but "objects".
         cache_dir: where targets are kept.
         image_size: ``(H, W)`` to which images are resized, whatever their aspect.
@@ -49,7 +59,8 @@ class SceneDataset(Dataset[SceneBatch]):
         targets: some of ``TARGETS``.
         input_mask: whether the amodal mask is given as a fourth channel of the images.
         min_views: fewest different frames of a scene.
-        seed: of the random frames.
+        augmentation: random changes of each scene, for training; None for none.
+        seed: of the random frames and of the augmentation.
 
     Raises:
         ConfigError: unknown targets, or a target whose files are not given.
@@ -62,7 +73,7 @@ class SceneDataset(Dataset[SceneBatch]):
         scans_root: Path,
         cache_dir: Path,
         scene_ids: Sequence[str] | None = None,
-        annotations: Path | None = None,
+        annotations: Path | Mapping[str, SceneAnnotation] | None = None,
         shapenet_root: Path | None = None,
         image_size: tuple[int, int] = (480, 640),
         num_views: int = 20,
@@ -72,12 +83,15 @@ class SceneDataset(Dataset[SceneBatch]):
         targets: Collection[str] = TARGETS,
         input_mask: bool = False,
         min_views: int = MIN_VIEWS,
+        augmentation: Augmentation | None = None,
         seed: int = 0,
     ) -> None:
         _check(targets, view_choice, annotations, shapenet_root, input_mask)
-        self._scans_root = Path(scans_root)
-        self._annotations = read_annotations(annotations) if annotations is not None else {}
-        self.scene_ids = _choose_scenes(self._scans_root, scene_ids, annotations, self._annotations)
+        if isinstance(annotations, str | Path):
+            annotations = read_annotations(Path(annotations))
+        self.scene_ids = choose_scenes(Path(scans_root), scene_ids, annotations)
+        self._scans = RecentScans(Path(scans_root), _MEMORY_OF_SCANS)
+        self._objects_of = ObjectTable([_objects_in(annotations, scene_id) for scene_id in self.scene_ids])
         self._shapenet_root = None if shapenet_root is None else Path(shapenet_root)
         self._cache = MaskCache(folder=Path(cache_dir))
         self._image_size = (int(image_size[0]), int(image_size[1]))
@@ -86,10 +100,10 @@ class SceneDataset(Dataset[SceneBatch]):
         self._grid_resolution, self._grid_extent = grid_resolution, grid_extent
         self._targets = frozenset(targets)
         self._input_mask = input_mask
+        self._augmentation = augmentation
         self._seed = seed
         # In shared memory, so that workers which outlive an epoch see the next one.
         self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
-        self._scans: dict[str, Scan] = {}
 
     def __len__(self) -> int:
         return len(self.scene_ids)
@@ -104,45 +118,54 @@ class SceneDataset(Dataset[SceneBatch]):
         Raises:
             DataError: the scan, its images or the CAD models cannot be read.
         """
-        scene_id = self.scene_ids[index]
-        scan = self._scan(scene_id)
+        scan = self._scans[self.scene_ids[index]]
         views, used = scan_views(
             scan, self._choose(len(scan), index), image_size=self._image_size, min_views=self._min_views
         )
-        cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], self._image_size)
-        grid_center = cameras.position.mean(dim=0)
-        objects = self._objects(scene_id)
-        foreground = self._foreground(objects, cameras)
-        if self._input_mask and foreground is not None:
-            views = replace(
-                views, images=torch.cat([views.images, foreground[:, :, None].byte() * 255], dim=2)
-            )
-        return SceneBatch(
-            scene_id=(scene_id,),
-            views=views,
-            frame_id=(tuple(scan.frame_id[i] for i in used),),
-            grid_center=grid_center[None],
-            objects=(self._without_unasked(objects),) if self._targets & {"objects", "shapes"} else None,
-            occupancy=self._occupancy(objects, grid_center),
-            foreground=foreground if "foreground" in self._targets else None,
+        scene = self._scene(scan, views, used, self._with_shapes(self._objects_of[index]))
+        if self._augmentation is not None:
+            scene = self._augmentation(scene, self._generator(index, _AUGMENTATION))
+        objects = () if scene.objects is None else scene.objects
+        wanted = self._targets & {"objects", "shapes"}
+        return replace(
+            scene,
+            objects=tuple(self._without_unasked(part) for part in objects) if wanted else None,
+            occupancy=self._occupancy(objects[0], scene.grid_center[0]) if objects else None,
+            foreground=scene.foreground if "foreground" in self._targets else None,
         )
 
-    def _scan(self, scene_id: str) -> Scan:
-        if scene_id not in self._scans:
-            self._scans[scene_id] = read_scan(self._scans_root / scene_id)
-        return self._scans[scene_id]
+    def _scene(self, scan: Scan, views: Views, used: Sequence[int], objects: ObjectSet) -> SceneBatch:
+        """Return a scene as it is on disk, with masks if they are wanted."""
+        cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], self._image_size)
+        foreground = self._foreground(objects, cameras)
+        if self._input_mask and foreground is not None:
+            mask = foreground[:, :, None].byte() * 255
+            views = replace(views, images=torch.cat([views.images, mask], dim=2))
+        return SceneBatch(
+            scene_id=(scan.scene_id,),
+            views=views,
+            frame_id=(tuple(scan.frame_id[i] for i in used),),
+            grid_center=cameras.position.mean(dim=0, keepdim=True),
+            objects=(objects,),
+            foreground=foreground,
+        )
 
     def _choose(self, n: int, index: int) -> list[int]:
         if self._view_choice == "even":
-            return choose_even(n, self._num_views).tolist()
-        state = np.random.SeedSequence([self._seed, int(self._epoch), index]).generate_state(1, np.uint64)
-        generator = torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
-        return choose_random(n, self._num_views, generator).tolist()
+            chosen = choose_even(n, self._num_views).tolist()
+        else:
+            chosen = choose_random(n, self._num_views, self._generator(index)).tolist()
+        if self._augmentation is None:
+            return chosen
+        return self._augmentation.drop_frames(chosen, self._min_views, self._generator(index, _DROPOUT))
 
-    def _objects(self, scene_id: str) -> ObjectSet:
-        if scene_id not in self._annotations:
-            return ObjectSet.empty()
-        objects = scene_objects(self._annotations[scene_id])
+    def _generator(self, index: int, *purpose: int) -> torch.Generator:
+        """Return the source of randomness of scene ``index`` in this epoch, one for each purpose."""
+        seeds = np.random.SeedSequence([self._seed, int(self._epoch), index, *purpose])
+        state = seeds.generate_state(1, np.uint64)
+        return torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
+
+    def _with_shapes(self, objects: ObjectSet) -> ObjectSet:
         if self._shapenet_root is None or not self._targets & {"shapes", "occupancy"}:
             return objects
         shapes = shape_grids(objects.model_id, shapenet_root=self._shapenet_root, cache=self._cache)
@@ -183,19 +206,18 @@ def scan2cad_dataset(root: Path, split: str, *, cache_dir: Path, **options: Any)
         raise DataError(
             f"there is no folder {root / 'scannet' / 'scans'}: prepare the data set or mend its path"
         )
-    listed = _read_split(root / "scannet", split)
-    annotations = root / "scan2cad" / "full_annotations.json"
-    scene_ids = None
-    if listed is not None:
-        annotated = read_annotations(annotations)
-        scene_ids = [
-            scene_id for scene_id in listed if scene_id in annotated and annotated[scene_id].model_id
-        ]
-        if not scene_ids:
-            raise DataError(
-                f"no scene with objects in {annotations} is in the {split} split: "
-                "check that annotation and split belong together"
-            )
+    listed = read_split(root / "scannet", split)
+    path = root / "scan2cad" / "full_annotations.json"
+    annotations = read_annotations(path)
+    having = set(annotated(annotations))
+    if not having:
+        raise DataError(f"there is no scene with objects in {path}: copy the whole file")
+    scene_ids = None if listed is None else [scene_id for scene_id in listed if scene_id in having]
+    if scene_ids == []:
+        raise DataError(
+            f"no scene with objects in {path} is in the {split} split: "
+            "check that annotation and split belong together"
+        )
     return SceneDataset(
         scans_root=root / "scannet" / "scans",
         scene_ids=scene_ids,
@@ -206,20 +228,10 @@ def scan2cad_dataset(root: Path, split: str, *, cache_dir: Path, **options: Any)
     )
 
 
-def _read_split(scannet: Path, split: str) -> list[str] | None:
-    """Return the scans of a split, or None if there are no split files at all."""
-    path = scannet / f"scannetv2_{split}.txt"
-    if path.is_file():
-        return path.read_text(encoding="utf-8").split()
-    if any(scannet.glob("scannetv2_*.txt")):
-        raise DataError(f"there is no {path}: choose a split that has a file, or write its scans there")
-    return None
-
-
 def _check(
     targets: Collection[str],
     view_choice: str,
-    annotations: Path | None,
+    annotations: object,
     shapenet_root: Path | None,
     mask: bool,
 ) -> None:
@@ -234,28 +246,7 @@ def _check(
         raise ConfigError("shapes, occupancy and masks need CAD models: give shapenet_root")
 
 
-def _choose_scenes(
-    scans_root: Path,
-    scene_ids: Sequence[str] | None,
-    source: Path | None,
-    annotations: dict[str, SceneAnnotation],
-) -> tuple[str, ...]:
-    if not scans_root.is_dir():
-        raise DataError(f"there is no folder {scans_root}: prepare the data set or mend its path")
-    if scene_ids is None:
-        present = sorted(path.name for path in scans_root.iterdir() if path.is_dir())
-        scene_ids = (
-            present
-            if source is None
-            else [s for s in present if s in annotations and annotations[s].model_id]
-        )
-        if not scene_ids:
-            wanted = f"with objects in {source}" if source is not None else "at all"
-            raise DataError(f"no scene {wanted} lies in {scans_root}: check that the paths belong together")
-    missing = [scene_id for scene_id in scene_ids if not (scans_root / scene_id).is_dir()]
-    if missing:
-        raise DataError(
-            f"{len(missing)} of {len(scene_ids)} scans are not in {scans_root}, the first is {missing[0]}: "
-            "add them or take them from the list"
-        )
-    return tuple(scene_ids)
+def _objects_in(annotations: Mapping[str, SceneAnnotation] | None, scene_id: str) -> ObjectSet:
+    if annotations is None or scene_id not in annotations:
+        return ObjectSet.empty()
+    return scene_objects(annotations[scene_id])

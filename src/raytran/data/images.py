@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
@@ -20,8 +22,8 @@ _log = logging.getLogger(__name__)
 MIN_VIEWS = 2
 """Fewest different frames from which a scene is reconstructed."""
 
-_UNREADABLE = (OSError, SyntaxError, ValueError)
-"""What Pillow raises for files that are truncated, damaged or no images."""
+_UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
+"""What Pillow raises for files that are truncated, damaged, absurdly large or no images."""
 
 
 def read_image(path: Path, image_size: tuple[int, int], *, stored: tuple[int, int] | None = None) -> Tensor:
@@ -38,22 +40,51 @@ def read_image(path: Path, image_size: tuple[int, int], *, stored: tuple[int, in
     Raises:
         DataError: the file is truncated, damaged, or of another size than ``stored``.
     """
-    height, width = image_size
+    return decode_image(path, name=str(path), image_size=image_size, stored=stored)
+
+
+def decode_image(
+    image: Path | bytes,
+    *,
+    name: str,
+    image_size: tuple[int, int] | None = None,
+    stored: tuple[int, int] | None = None,
+) -> Tensor:
+    """Read an image that lies in a file of its own or in memory.
+
+    Args:
+        image: path or content of a JPEG or PNG file.
+        name: what to call it in errors.
+        image_size: ``(H, W)`` wanted, or None to keep its size.
+        stored: ``(H, W)`` that the image must have, or None for any.
+
+    Returns:
+        ``(3, H, W)`` uint8 RGB, a view of ``(H, W, 3)``.
+
+    Raises:
+        DataError: the image is truncated, damaged, or of another size than ``stored``.
+    """
     try:
-        with Image.open(path) as image:
-            if stored is not None and image.size != stored[::-1]:
+        with Image.open(BytesIO(image) if isinstance(image, bytes) else image) as opened:
+            if stored is not None and opened.size != stored[::-1]:
                 raise DataError(
-                    f"{path} is {image.size[0]}x{image.size[1]}, not {stored[1]}x{stored[0]} as the others"
+                    f"{name} is {opened.size[0]}x{opened.size[1]}, not {stored[1]}x{stored[0]} as the others"
                 )
+            size = opened.size if image_size is None else image_size[::-1]
             # A JPEG decodes at ½, ¼ or ⅛ of its size for less time, but not below what is asked for.
-            image.draft("RGB", (width, height))
-            pixels = image if image.mode == "RGB" else image.convert("RGB")
-            if pixels.size != (width, height):
-                pixels = pixels.resize((width, height), Image.Resampling.BILINEAR)
+            opened.draft("RGB", size)
+            pixels = opened if opened.mode == "RGB" else opened.convert("RGB")
+            if pixels.size != size:
+                pixels = pixels.resize(size, Image.Resampling.BILINEAR)
             array = np.array(pixels)
     except _UNREADABLE as error:
-        raise DataError(f"cannot read the image {path} ({error}): copy or export it again") from error
+        raise DataError(f"cannot read the image {name} ({error}): copy or export it again") from error
     return torch.from_numpy(array).permute(2, 0, 1)
+
+
+def resize(pixels: NDArray[np.uint8], image_size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Resize ``(H, W, 3)`` pixels to ``image_size`` (H, W) as the images of files are."""
+    return np.array(Image.fromarray(pixels).resize(image_size[::-1], Image.Resampling.BILINEAR))
 
 
 def read_images(
@@ -81,43 +112,85 @@ def read_images(
     Raises:
         DataError: fewer than ``min_views`` different images can be read.
     """
-    reader = _Reader(paths, image_size, stored)
+    return read_frames(
+        lambda position: read_image(paths[position], image_size, stored=stored),
+        len(paths),
+        chosen,
+        where=paths[0].parent,
+        min_views=min_views,
+    )
+
+
+def read_frames(
+    read: Callable[[int], Tensor],
+    num_frames: int,
+    chosen: Sequence[int],
+    *,
+    where: Path,
+    min_views: int = MIN_VIEWS,
+) -> tuple[Tensor, list[int]]:
+    """Do as ``read_images`` does with frames that need not be files.
+
+    Args:
+        read: returns ``(3, H, W)`` uint8 of the frame at a position, or raises DataError if it is damaged.
+        num_frames: number of frames of the scan.
+        chosen: positions of N of them.
+        where: what to name in messages.
+        min_views: fewest different images, or as many as were chosen if that is less.
+
+    Returns:
+        ``(N, 3, H, W)`` uint8 and the N positions that were read.
+
+    Raises:
+        DataError: fewer than ``min_views`` different images can be read.
+    """
+    reader = _Reader(read, len(chosen))
     good = [position for position in chosen if reader.can_read(position)]
     for position in [position for position in chosen if position in reader.failed]:
-        near_to_far = np.argsort(np.abs(np.arange(len(paths)) - position), kind="stable").tolist()
+        near_to_far = np.argsort(np.abs(np.arange(num_frames) - position), kind="stable").tolist()
         fresh = (other for other in near_to_far if other not in good and reader.can_read(other))
         again = (other for other in near_to_far if other in good)
         good.extend(other for other in [next(fresh, next(again, -1))] if other >= 0)
     if reader.failed:
         first = next(iter(reader.failed.values()))
-        _warn_once(f"skipped {len(reader.failed)} unreadable images of {paths[0].parent.parent}: {first}")
+        _warn_once(f"skipped {len(reader.failed)} unreadable images of {where}: {first}")
     if len(set(good)) < min(min_views, len(chosen)):
         raise DataError(
-            f"only {len(set(good))} of {len(paths)} usable frames in {paths[0].parent} can be read and "
+            f"only {len(set(good))} of {num_frames} usable frames in {where} can be read and "
             f"{min_views} are needed: copy or export them again"
         )
     used = sorted(good)
-    return torch.stack([reader.images[position] for position in used]), used
+    return reader.images_at(used), used
 
 
 class _Reader:
-    """Reads each image of a scan at most once and remembers those that cannot be read."""
+    """Reads each image of a scan at most once, into one tensor, and remembers those that cannot be read."""
 
-    def __init__(self, paths: Sequence[Path], image_size: tuple[int, int], stored: tuple[int, int]) -> None:
-        self.images: dict[int, Tensor] = {}
+    def __init__(self, read: Callable[[int], Tensor], count: int) -> None:
         self.failed: dict[int, DataError] = {}
-        self._paths, self._image_size, self._stored = paths, image_size, stored
+        self._read, self._count = read, count
+        self._images = torch.empty(0)
+        self._row: dict[int, int] = {}
 
     def can_read(self, position: int) -> bool:
         """Read the image at ``position``, if that was not tried before, and return whether it is there."""
-        if position not in self.images and position not in self.failed:
+        if position not in self._row and position not in self.failed:
             try:
-                self.images[position] = read_image(
-                    self._paths[position], self._image_size, stored=self._stored
-                )
+                image = self._read(position)
             except DataError as error:
                 self.failed[position] = error
-        return position in self.images
+                return False
+            if not self._row:
+                self._images = torch.empty(self._count, *image.shape, dtype=image.dtype)
+            self._row[position] = len(self._row)
+            # At once, so that the memory of one image serves them all: fresh memory costs more than the copy.
+            self._images[self._row[position]] = image
+        return position in self._row
+
+    def images_at(self, positions: Sequence[int]) -> Tensor:
+        """Return the images at positions that were read, ``(N, 3, H, W)``."""
+        rows = [self._row[position] for position in positions]
+        return self._images if rows == list(range(self._count)) else self._images[rows]
 
 
 def stored_size(paths: Sequence[Path]) -> tuple[int, int]:

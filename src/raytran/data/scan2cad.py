@@ -26,7 +26,7 @@ _SYMMETRY = {
     "__SYM_ROTATE_UP_INF": SYMMETRY_INFINITE,
 }
 
-_SMALLEST_SCALE = 1e-3
+SMALLEST_SCALE = 1e-3
 """Models with a smaller scale along any axis are mistakes of annotation (ODAM skips the same)."""
 
 _THINNEST = 1e-3
@@ -68,25 +68,51 @@ def read_annotations(path: Path) -> dict[str, SceneAnnotation]:
     Raises:
         DataError: the file is missing, no JSON, or an entry lacks a field.
     """
+    entries = read_entries(path)
+    scenes: dict[str, SceneAnnotation] = {}
+    for number, entry in enumerate(entries):
+        try:
+            scene = parse_entry(entry)
+            if scene.scene_id in scenes:
+                raise DataError(f"scene {scene.scene_id} occurs twice")
+        except DataError as error:
+            raise DataError(
+                f"entry {number} of {path} is not as in Scan2CAD's full_annotations.json ({error}): "
+                "copy the file again"
+            ) from error
+        scenes[scene.scene_id] = scene
+    return scenes
+
+
+def read_entries(path: Path) -> list[Any]:
+    """Return the entries of an annotation file as they are.
+
+    Raises:
+        DataError: the file is missing, no JSON, or no list.
+    """
     try:
         entries = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise DataError(f"cannot read the annotations {path} ({error.strerror}): check the path") from error
     except ValueError as error:
         raise DataError(f"{path} is not valid JSON ({error}): copy it again") from error
-    scenes: dict[str, SceneAnnotation] = {}
+    if not isinstance(entries, list):
+        raise DataError(f"{path} is not a list of scenes as Scan2CAD's full_annotations.json: check the path")
+    return entries
+
+
+def parse_entry(entry: Any) -> SceneAnnotation:
+    """Return one entry of an annotation file, checked.
+
+    Raises:
+        DataError: it lacks a field or holds something impossible; says what, not where.
+    """
     try:
-        for entry in entries:
-            scene = _scene(entry)
-            if scene.scene_id in scenes:
-                raise ValueError(f"scene {scene.scene_id} occurs twice")
-            scenes[scene.scene_id] = scene
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
-        raise DataError(
-            f"entry {len(scenes)} of {path} is not as in Scan2CAD's full_annotations.json "
-            f"({type(error).__name__}: {error}): copy the file again"
-        ) from error
-    return scenes
+        return _scene(entry)
+    except KeyError as error:
+        raise DataError(f"it has no field {error}") from error
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise DataError(f"{type(error).__name__}: {error}") from error
 
 
 def scene_objects(annotation: SceneAnnotation) -> ObjectSet:
@@ -103,7 +129,7 @@ def scene_objects(annotation: SceneAnnotation) -> ObjectSet:
     """
     pose = annotation.scan_from_cad
     scale = pose[:, :3, :3].norm(dim=1)
-    keep = (scale >= _SMALLEST_SCALE).all(dim=1)
+    keep = (scale >= SMALLEST_SCALE).all(dim=1)
     if not keep.all():
         _log.warning("%s: skipped %d models with a degenerate scale", annotation.scene_id, int((~keep).sum()))
     classes = [CLASS_BY_CATID.get(name.split("/")[0], "other") for name in annotation.model_id]
@@ -155,9 +181,15 @@ def _scene(entry: dict[str, Any]) -> SceneAnnotation:
         @ _matrices([model["trs"] for model in models]),
         box_center=_vectors([model["center"] for model in models], 3),
         box_half_size=_vectors([model["bbox"] for model in models], 3),
-        symmetry=torch.tensor([_SYMMETRY[model["sym"]] for model in models], dtype=torch.int64),
+        symmetry=torch.tensor([_symmetry(model["sym"]) for model in models], dtype=torch.int64),
         scale=_vectors([model["trs"]["scale"] for model in models], 3),
     )
+
+
+def _symmetry(name: str) -> int:
+    if name not in _SYMMETRY:
+        raise ValueError(f"unknown symmetry {name!r}")
+    return _SYMMETRY[name]
 
 
 def _matrices(trs: Sequence[dict[str, Sequence[float]]]) -> Tensor:

@@ -12,12 +12,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from raytran.data.cache import MaskCache, digest, file_digest
-from raytran.data.shapenet import STEM, model_folder, read_mesh
+from raytran.data.shapenet import mesh_path, read_mesh
 from raytran.data.voxelize import voxelize_solid
+from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.ops.rasterize import rasterize_mask
 from raytran.types import SHAPE_SIZE, ObjectSet
+
+_MAX_POINTS = 1 << 25
+"""Most points that may fill one object's box; with more it is far larger than any room."""
 
 _VERSION = 1
 """Part of every key; raise it when the way a target is computed changes."""
@@ -37,15 +41,15 @@ def shape_grids(model_ids: tuple[str, ...], *, shapenet_root: Path, cache: MaskC
     Raises:
         DataError: a CAD file is missing or cannot be read.
     """
-    grids = np.zeros((len(model_ids), SHAPE_SIZE, SHAPE_SIZE, SHAPE_SIZE), dtype=bool)
-    for grid, model_id in zip(grids, model_ids, strict=True):
-        content = _content(shapenet_root, model_id)
-        key = digest(_VERSION, SHAPE_SIZE, content)
-        stored = cache.read("shape", key, grid.shape)
-        if stored is None:
-            stored = voxelize_solid(*_unit_mesh(shapenet_root, model_id, content), size=SHAPE_SIZE)
-            cache.write("shape", key, stored)
-        grid[:] = stored
+    contents = [_content(shapenet_root, model_id) for model_id in model_ids]
+    keys = [digest(_VERSION, SHAPE_SIZE, content) for content in contents]
+    grids, missing = cache.read_stack("shape", keys, (SHAPE_SIZE,) * 3)
+    for i in missing:
+        if (first := keys.index(keys[i])) < i:
+            grids[i] = grids[first]
+        else:
+            grids[i] = voxelize_solid(*_unit_mesh(shapenet_root, model_ids[i], contents[i]), size=SHAPE_SIZE)
+            cache.write("shape", keys[i], grids[i])
     return torch.from_numpy(grids)
 
 
@@ -61,14 +65,27 @@ def scene_occupancy(objects: ObjectSet, grid: VoxelGrid) -> Tensor:
 
     Returns:
         ``(X, Y, Z)`` bool.
+
+    Raises:
+        DataError: an object is too large for the voxels, as if given in another unit.
     """
-    occupied = torch.zeros(grid.num_voxels, dtype=torch.bool)
+    occupied = np.zeros(grid.num_voxels, dtype=bool)
     if objects.shape is not None:
-        for shape, size, rotation, center in zip(
-            objects.shape, objects.size, objects.rotation, objects.center, strict=True
-        ):
-            occupied[_voxels_of(shape, size, rotation, center, grid)] = True
-    return occupied.reshape(grid.resolution)
+        lower, voxel = grid.lower.double().numpy(), grid.voxel_size.double().numpy()
+        for m, shape in enumerate(objects.shape.numpy()):
+            size, rotation, center = _box_of(objects, m)
+            cell = size / len(shape) / voxel.min()
+            if not np.ceil(2 * cell).clip(1).prod() * shape.size <= _MAX_POINTS:
+                width, height, depth = size.tolist()
+                raise DataError(
+                    f"an object of {width:.4g} × {height:.4g} × {depth:.4g} m is too large for voxels of "
+                    f"{voxel.min():.4g} m: check the unit and the scale of the annotation"
+                )
+            # Continuous voxel coordinates of the object's cells: origin + voxel_from_cell @ (i, j, k).
+            voxel_from_cell = rotation * (size / len(shape)) / voxel[:, None]
+            origin = (center - rotation @ size / 2 - lower) / voxel
+            occupied[_voxels_of(shape, cell, voxel_from_cell, origin, grid.resolution)] = True
+    return torch.from_numpy(occupied.reshape(grid.resolution))
 
 
 def foreground_masks(
@@ -95,9 +112,8 @@ def foreground_masks(
         digest(scene, cameras.image_size, *camera)
         for camera in zip(intrinsics, world_from_camera, strict=True)
     ]
-    stored = [cache.read("foreground", key, cameras.image_size) for key in keys]
-    masks = np.stack([np.zeros(cameras.image_size, dtype=bool) if mask is None else mask for mask in stored])
-    if missing := [i for i, mask in enumerate(stored) if mask is None]:
+    masks, missing = cache.read_stack("foreground", keys, cameras.image_size)
+    if missing:
         meshes = [
             _place(_unit_mesh(shapenet_root, model_id, content), objects, m)
             for m, (model_id, content) in enumerate(zip(objects.model_id, contents, strict=True))
@@ -111,7 +127,7 @@ def foreground_masks(
 
 def _content(shapenet_root: Path, model_id: str) -> str:
     """Return a digest of a model's mesh file."""
-    return file_digest(model_folder(shapenet_root, *model_id.split("/")) / f"{STEM}.obj")
+    return file_digest(mesh_path(shapenet_root, *model_id.split("/")))
 
 
 @lru_cache(maxsize=64)
@@ -130,23 +146,66 @@ def _unit_mesh(shapenet_root: Path, model_id: str, _content: str) -> tuple[NDArr
 
 def _place(unit_mesh: tuple[NDArray, NDArray], objects: ObjectSet, m: int) -> tuple[NDArray, NDArray]:
     vertices, faces = unit_mesh
-    size, rotation, center = (t[m].double().numpy() for t in (objects.size, objects.rotation, objects.center))
+    size, rotation, center = _box_of(objects, m)
     return (vertices * size) @ rotation.T + center, faces
 
 
-def _voxels_of(shape: Tensor, size: Tensor, rotation: Tensor, center: Tensor, grid: VoxelGrid) -> Tensor:
-    """Return the number of the voxel of each point that fills an object's solid cells, inside the grid."""
-    cell = size / shape.shape[0]
-    spacing = float(grid.voxel_size.min()) / 2
-    inner = torch.cartesian_prod(
-        *((torch.arange(n) + 0.5) / n for n in (cell / spacing).ceil().int().tolist())
-    )
-    points = (shape.nonzero().T[:, :, None] + inner.T[:, None]).flatten(1)
-    voxel_from_cell = rotation * cell / grid.voxel_size[:, None]
-    origin = (center - rotation @ size / 2 - grid.lower) / grid.voxel_size
-    # One row per axis, in floating point up to the end: a few hundred thousand points for every object.
-    index = torch.addmm(origin[:, None], voxel_from_cell, points).floor_()
-    inside = index[0] >= 0
-    for axis, count in enumerate(grid.resolution):
-        inside &= (index[axis] >= 0) & (index[axis] < count)
-    return grid.flat_index(index[:, inside].T.long())
+def _box_of(objects: ObjectSet, m: int) -> tuple[NDArray, NDArray, NDArray]:
+    """Return size ``(3,)``, rotation ``(3, 3)`` and center ``(3,)`` of object ``m``, float64."""
+    size, rotation, center = (t[m].double().numpy() for t in (objects.size, objects.rotation, objects.center))
+    return size, rotation, center
+
+
+def _voxels_of(
+    shape: NDArray[np.bool_],
+    cell: NDArray[np.float64],
+    voxel_from_cell: NDArray[np.float64],
+    origin: NDArray[np.float64],
+    resolution: tuple[int, int, int],
+) -> NDArray[np.int64]:
+    """Return the numbers of the voxels, inside the grid, of points that fill an object's solid cells.
+
+    Args:
+        shape: ``(S, S, S)`` solid cells.
+        cell: ``(3,)`` sides of a cell in units of the shortest side of a voxel.
+        voxel_from_cell: ``(3, 3)``, as ``origin`` ``(3,)``: the map from cells to voxels.
+        origin: voxel coordinates of the corner of cell (0, 0, 0).
+        resolution: of the grid.
+    """
+    parts = np.maximum(np.ceil(2 * cell), 1).astype(np.int64)
+    if parts.max() > 1:
+        for axis, count in enumerate(parts.tolist()):
+            shape = shape.repeat(count, axis=axis)
+    elif (cell <= 0.25).all():
+        shape = _enough_cells(shape, cell)
+    row, k = np.divmod(np.flatnonzero(shape), shape.shape[2])
+    along = [(np.arange(n) + 0.5) / count for n, count in zip(shape.shape, parts, strict=True)]
+    number = np.zeros(len(k))
+    inside = np.ones(len(k), dtype=bool)
+    for (x, y, z), start, count in zip(voxel_from_cell, origin, resolution, strict=True):
+        place = np.add.outer(along[0] * x + start, along[1] * y).ravel()[row] + (along[2] * z)[k]
+        inside &= (place >= 0) & (place < count)
+        number *= count
+        number += np.floor(place, out=place)
+    return number[inside].astype(np.int64)
+
+
+def _enough_cells(shape: NDArray[np.bool_], cell: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return solid cells that meet the same voxels as all of them, if cells are small (``_voxels_of``).
+
+    They are the cells with a neighbour that is not solid, and of the inner ones those on a lattice of half a
+    voxel. A voxel that meets an inner cell, but none with such a neighbour, holds solid cells alone (it is
+    convex and several cells wide), hence a point of the lattice, which no ball as wide as a voxel misses.
+    """
+    core = shape
+    for axis in range(3):
+        low, middle, high = (
+            core[(slice(None),) * axis + (part,)] for part in (slice(None, -2), slice(1, -1), slice(2, None))
+        )
+        core = low & middle & high
+    chosen = shape.copy()
+    chosen[1:-1, 1:-1, 1:-1] &= ~core
+    steps = np.clip(0.5 / np.maximum(cell, 1e-9), 1, len(shape)).astype(np.int64)
+    lattice = tuple(slice(int(step) // 2, None, int(step)) for step in steps)
+    chosen[lattice] = shape[lattice]
+    return chosen

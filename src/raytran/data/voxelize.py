@@ -22,6 +22,9 @@ Columns = tuple[NDArray[np.int64], NDArray[np.int64]]
 _SHIFT = (1.37e-4, 2.11e-4)
 _VOTES_NEEDED = 4
 
+_MAX_CELLS = 1 << 20
+"""Cells that the boxes of the triangles cut at once may meet, over all three axes."""
+
 
 def voxelize_solid(vertices: ArrayLike, faces: ArrayLike, size: int = SHAPE_SIZE) -> Cells:
     """Return the cells of a mesh's own box that lie inside it or on its surface.
@@ -56,13 +59,26 @@ def scan_convert(points: Floats, faces: ArrayLike, size: int) -> tuple[Cells, Ce
     """
     triangles = points[_without_duplicates(points, np.asarray(faces, dtype=np.int64))]
     surface = np.zeros((size, size, size), dtype=bool)
+    crossings = [np.zeros((size + 1, size, size), dtype=np.int32) for _ in range(3)]
+    for block in _blocks(triangles, size):
+        for axis in range(3):
+            cut, depth, sign = _cut_columns(block, axis, size)
+            surface[_at(cut, axis, np.clip(depth.astype(np.int64), 0, size - 1))] = True
+            above = np.clip(np.ceil(depth - 0.5), 0, size).astype(np.int64)
+            np.add.at(crossings[axis], (above, *cut), sign.astype(np.int32))
+        _mark_edges(block, surface)
     votes = np.zeros((size, size, size), dtype=np.int8)
     for axis in range(3):
-        cut, depth, sign = _cut_columns(triangles, axis, size)
-        votes += _column_votes(cut, depth, sign, axis, size)
-        surface[_at(cut, axis, np.clip(depth.astype(np.int64), 0, size - 1))] = True
-    _mark_edges(triangles, surface)
+        votes += _votes(crossings[axis], axis)
     return votes >= _VOTES_NEEDED, surface
+
+
+def _blocks(triangles: Floats, size: int) -> list[Floats]:
+    """Split triangles into runs that meet so few cells that cutting them takes little memory."""
+    width = np.minimum(np.ptp(triangles, axis=1), size) + 1
+    cells = (width * np.roll(width, 1, axis=1)).sum(axis=1)
+    number = np.cumsum(cells) // _MAX_CELLS
+    return np.split(triangles, np.flatnonzero(np.diff(number)) + 1)
 
 
 def _without_duplicates(points: Floats, faces: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -123,31 +139,21 @@ def _expand(first: Floats, last: Floats, size: int) -> tuple[NDArray[np.int64], 
     return owner, low[owner] + np.arange(len(owner)) - start[owner]
 
 
-def _column_votes(cut: Columns, depth: Floats, sign: Floats, axis: int, size: int) -> NDArray[np.int8]:
-    """Return ``(S, S, S)`` votes [x, y, z], 0 to 2, of the two directions along ``axis``."""
-    above = np.ceil(depth - 0.5).astype(np.int64)
-    turn = sign.astype(np.int16)
-    total = np.zeros((size, size), dtype=np.int16)
-    np.add.at(total, cut, turn)
-    within = above < size
-    winding = np.zeros((size, size, size), dtype=np.int16)
-    column = cut[0][within], cut[1][within]
-    np.add.at(winding, _at(column, axis, np.maximum(above[within], 0)), turn[within])
-    _accumulate(winding, axis)
-    # The columns along y are numbered (z, x).
-    beyond = np.expand_dims(total.T if axis == 1 else total, axis)
-    return (winding != 0).astype(np.int8) + (winding != beyond)
+def _votes(crossings: NDArray[np.int32], axis: int) -> NDArray[np.int8]:
+    """Return ``(S, S, S)`` votes [x, y, z], 0 to 2, of the two directions along ``axis``.
 
-
-def _accumulate(values: NDArray[np.int16], axis: int) -> None:
-    """Replace ``(S, S, S)`` values by their running sums along ``axis``."""
-    if axis == 2:
-        np.cumsum(values, axis=2, out=values)
-        return
-    # ``np.cumsum`` along an outer axis is several times slower than adding whole planes.
-    planes = np.moveaxis(values, axis, 0)
-    for i in range(1, len(planes)):
-        planes[i] += planes[i - 1]
+    Args:
+        crossings: ``(S + 1, S, S)`` sum of the signs of the cuts between one cell and the next along
+            ``axis``; then the column's cell along the other two axes in cyclic order. Overwritten.
+        axis: 0, 1 or 2.
+    """
+    # ``np.cumsum`` along the first axis is several times slower than adding whole planes.
+    for i in range(1, len(crossings)):
+        crossings[i] += crossings[i - 1]
+    winding, beyond = crossings[:-1], crossings[-1]
+    votes = (winding != 0).astype(np.int8) + (winding != beyond)
+    # From (axis, axis + 1, axis + 2) to (x, y, z).
+    return votes.transpose([(i - axis) % 3 for i in range(3)])
 
 
 def _at(column: Columns, axis: int, depth: NDArray[np.int64]) -> tuple[NDArray[np.int64], ...]:

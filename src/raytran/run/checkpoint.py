@@ -7,7 +7,7 @@ import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from raytran.errors import CheckpointError
 from raytran.training.checkpoint_file import FORMAT, read_checkpoint
@@ -19,16 +19,16 @@ _PREFIX = "model."
 
 
 def checkpoint_card(
-    *, stage: str, preset: str, model: Mapping[str, Any], views: Mapping[str, Any], parent: str | None
+    *, stage: str, preset: str, config: Mapping[str, Any], parent: Mapping[str, Any] | None
 ) -> dict[str, Any]:
     """Return the plain Python that identifies a checkpoint.
 
     Args:
         stage: name of the stage.
         preset: name of the preset.
-        model: resolved config of the model.
-        views: ``image_size`` [H, W], ``num_views`` in training and ``predict_views``.
-        parent: path of the checkpoint that the fit started from, or None.
+        config: all settings of the run, resolved; ``model`` rebuilds the network, ``views`` holds
+            ``image_size`` [H, W], ``num_views`` in training and ``predict_views``.
+        parent: the checkpoint that the fit started from (``path``, ``stage``, ``step``, ``scores``), or None.
     """
     from raytran.run.provenance import git_commit, versions
 
@@ -36,9 +36,10 @@ def checkpoint_card(
         "format": FORMAT,
         "stage": stage,
         "preset": preset,
-        "model": dict(model),
-        "views": dict(views),
-        "parent": parent,
+        "model": copy.deepcopy(config["model"]),
+        "views": copy.deepcopy(config["views"]),
+        "config": copy.deepcopy(dict(config)),
+        "parent": None if parent is None else dict(parent),
         "git_commit": git_commit(),
         "versions": versions(),
     }
@@ -77,23 +78,27 @@ def prediction_settings(path: str | Path) -> PredictionSettings:
         CheckpointError: the file is missing or damaged.
     """
     card = read_checkpoint(Path(path))
-    height, width = card["views"]["image_size"]
-    return PredictionSettings(card["preset"], card["stage"], (height, width), card["views"]["predict_views"])
+    views = card["views"]
+    try:
+        height, width = map(int, views["image_size"])
+        num_views = int(views["predict_views"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"{path} does not say which images its network wants: it is damaged") from error
+    return PredictionSettings(card["preset"], card["stage"], (height, width), num_views)
 
 
 def model_from(checkpoint: Mapping[str, Any], path: Path) -> RayTran:
-    """Return the model of a checkpoint that was read from ``path`` already."""
-    from hydra.utils import instantiate
+    """Return the model of a checkpoint that was read from ``path`` already.
 
-    config = copy.deepcopy(checkpoint["model"])
-    for target in _targets(config):
-        if not target.startswith("raytran."):
-            raise CheckpointError(
-                f"{path} asks to run '{target}', which is not part of raytran: do not use this file"
-            )
-    # The weights are in the checkpoint: nothing is to be fetched.
-    config.get("backbone", {}).get("resnet", {})["weights"] = None
-    model = cast("RayTran", instantiate(config, _convert_="all"))
+    Raises:
+        CheckpointError: the checkpoint describes no network of raytran, or its weights do not fit.
+    """
+    from raytran.model import RayTran
+    from raytran.run.checkpoint_config import build_network
+
+    model = build_network(checkpoint["model"], path)
+    if not isinstance(model, RayTran):
+        raise CheckpointError(f"{path} describes only a part of a network: do not use this file")
     load_weights(model, checkpoint, path)
     return model.eval()
 
@@ -117,13 +122,3 @@ def load_weights(model: RayTran, checkpoint: Mapping[str, Any], path: Path) -> N
             f"the weights in {path} (preset {checkpoint['preset']}) do not fit this model ({reason}): "
             "choose the preset and model settings that the checkpoint was trained with"
         ) from error
-
-
-def _targets(config: Any) -> list[str]:
-    """Return all ``_target_`` values inside a nested config."""
-    if isinstance(config, Mapping):
-        own = [str(config["_target_"])] if "_target_" in config else []
-        return own + [target for value in config.values() for target in _targets(value)]
-    if isinstance(config, list | tuple):
-        return [target for value in config for target in _targets(value)]
-    return []

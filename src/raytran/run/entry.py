@@ -7,6 +7,7 @@ import functools
 import os
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import hydra
@@ -19,9 +20,12 @@ from omegaconf.errors import OmegaConfBaseException
 from raytran.errors import ConfigError, RaytranError
 from raytran.run.config_dir import config_dir
 from raytran.run.folders import register_resolvers
+from raytran.run.sweep_folder import register_sweep_resolver
 
 _FULL_ERROR = "HYDRA_FULL_ERROR"
 """Hydra's own switch: with it set to 1, errors are shown at length."""
+
+_TYPED_FULL_ERROR = os.environ.get(_FULL_ERROR)
 
 
 def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Callable[[], Any]]:
@@ -31,9 +35,10 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
     printed as one sentence and the command exits with 1; any other exception is a defect, shown at length.
     """
     register_resolvers()
+    register_sweep_resolver()
 
     def decorate(function: Callable[[DictConfig], Any]) -> Callable[[], Any]:
-        typed = os.environ.get(_FULL_ERROR)
+        typed = _TYPED_FULL_ERROR
 
         @functools.wraps(function)
         def task(cfg: DictConfig) -> Any:
@@ -65,6 +70,9 @@ def _compose_or_exit(command: Callable[[], Any], typed: str | None) -> Any:
     except OverrideParseException as error:
         _set_full_error(typed)
         _exit_with(ConfigError(f"{_first_line(error)}: settings are written key=value"))
+    except RaytranError as error:  # of a sweep; those of a single run do not come so far
+        _set_full_error(typed)
+        _exit_with(error)
     except OmegaConfBaseException as error:
         _set_full_error(typed)
         # A resolver of ours that objects is wrapped by OmegaConf; its message is the clearer one.
@@ -80,6 +88,12 @@ def _set_full_error(value: str | None) -> None:
         os.environ.pop(_FULL_ERROR, None)
     else:
         os.environ[_FULL_ERROR] = value
+
+
+def user_environment() -> dict[str, str]:
+    """Return the environment as the user has set it, for another command to be started with."""
+    environment = {name: value for name, value in os.environ.items() if name != _FULL_ERROR}
+    return environment if _TYPED_FULL_ERROR is None else environment | {_FULL_ERROR: _TYPED_FULL_ERROR}
 
 
 def run_or_exit(function: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
@@ -106,10 +120,17 @@ def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
             must be among them if the result is to be run.
     """
     register_resolvers()
+    register_sweep_resolver()
     if GlobalHydra.instance().is_initialized():
         return hydra.compose(config_name, overrides=list(overrides))
     with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
         return hydra.compose(config_name, overrides=list(overrides))
+
+
+def quoted(path: Path) -> str:
+    """Return a path as Hydra's override grammar wants it."""
+    escaped = str(path).replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'
 
 
 def _exit_with(error: RaytranError) -> None:

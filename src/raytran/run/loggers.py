@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import csv
 import logging
 import os
 from netrc import NetrcParseError, netrc
@@ -12,10 +11,11 @@ from typing import Any
 from urllib.parse import urlparse
 
 from raytran.errors import ConfigError
+from raytran.training.metrics_table import read_table
 
 _log = logging.getLogger(__name__)
 
-LOGS = "logs"
+METRICS = "metrics.csv"
 
 
 def wandb_logger(*, project: str, name: str, save_dir: str) -> Any:
@@ -57,18 +57,7 @@ def tensorboard_logger(*, save_dir: str, name: str) -> Any:
 def read_history(folder: Path) -> dict[str, list[tuple[int, float]]]:
     """Return what a run logged: name → (step, value) pairs by rising step.
 
-    A resumed run writes a new table and may repeat the steps after its last checkpoint; the newest value of
-    a step counts.
-
     Args:
         folder: of the run.
     """
-    tables = (folder / LOGS).glob("version_*/metrics.csv")
-    history: dict[str, dict[int, float]] = {}
-    for table in sorted(tables, key=lambda path: int(path.parent.name.removeprefix("version_"))):
-        with table.open(newline="", encoding="utf-8") as file:
-            for row in csv.DictReader(file):
-                for name, value in row.items():
-                    if name not in ("step", "epoch") and value:
-                        history.setdefault(name, {})[int(row["step"])] = float(value)
-    return {name: sorted(values.items()) for name, values in history.items()}
+    return read_table(folder / METRICS)

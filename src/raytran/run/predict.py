@@ -72,7 +72,7 @@ def predict(cfg: DictConfig) -> Path:
     found = predict_scene(
         model,
         views,
-        scene_id=scene.name,
+        scene_id=scene.stem if scene.is_file() else scene.name,
         score_threshold=cfg.score_threshold,
         duplicate_iou=cfg.duplicate_iou,
     )

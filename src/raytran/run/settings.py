@@ -24,6 +24,7 @@ class RunConfig:
         outputs: top folder of all runs, searched by ``init_from=auto``.
         output_dir: folder of this run.
         init_from: ``auto``, ``none``, or a checkpoint whose weights to start from.
+        check_parent: refuse a parent that is of another stage or has not learned its task.
         resume: ``none``, ``auto``, or the checkpoint of an interrupted run to continue.
         checkpoint_every: optimiser steps between two writings of the last checkpoint.
         progress_bar: ``rich``, ``tqdm`` or ``none``.
@@ -35,6 +36,7 @@ class RunConfig:
     outputs: str
     output_dir: str
     init_from: str
+    check_parent: bool
     resume: str
     checkpoint_every: int
     progress_bar: str

@@ -10,6 +10,7 @@ import time
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import lightning.pytorch as pl
 from lightning.pytorch.utilities import rank_zero_only
@@ -19,10 +20,12 @@ from omegaconf import DictConfig, OmegaConf
 from raytran.errors import CheckpointError, ConfigError
 from raytran.run.build import build_data, build_model, build_module, build_trainer, plain
 from raytran.run.checkpoint import checkpoint_card, load_weights
-from raytran.run.folders import LAST, newest_finished, read_finished, write_finished
+from raytran.run.folders import LAST, read_finished, write_finished
+from raytran.run.parent import Parent, check_parent, find_parent
 from raytran.run.provenance import provenance
 from raytran.run.settings import RunConfig
-from raytran.training.checkpoint_file import read_checkpoint
+from raytran.training.callbacks.stop_signals import StopRequestedError
+from raytran.training.checkpoint_file import read_checkpoint, read_newest
 from raytran.training.reconstruction import Reconstruction
 from raytran.training.stage import Stage
 
@@ -67,13 +70,7 @@ def train(cfg: DictConfig) -> FitResult:
     pl.seed_everything(run.seed, workers=True, verbose=False)
     _quiet()
     module, resume_from, parent = _start(cfg, run)
-    card = checkpoint_card(
-        stage=module.stage.name,
-        preset=run.preset,
-        model=plain(cfg.model),
-        views=plain(cfg.views),
-        parent=parent,
-    )
+    card = checkpoint_card(stage=module.stage.name, preset=run.preset, config=plain(cfg), parent=parent)
     trainer = build_trainer(cfg, run, card)
     data = build_data(cfg)
     if trainer.is_global_zero:
@@ -82,8 +79,11 @@ def train(cfg: DictConfig) -> FitResult:
     began = time.monotonic()
     try:
         trainer.fit(module, data, ckpt_path=resume_from)
+    except StopRequestedError as stop:
+        # One rank tells the shell; Lightning and torchrun would take codes of the others for a crash.
+        raise SystemExit(128 + stop.signum if trainer.is_global_zero else 0) from stop
     except SystemExit as stop:
-        # Lightning turns Ctrl-C and SIGTERM into exits; the shell shall see which it was.
+        # Before the first step, or at the second Ctrl-C, Lightning turns a signal into an exit of its own.
         raise SystemExit(143 if isinstance(stop, SIGTERMException) else 130) from stop
     seconds = time.monotonic() - began
     if trainer.is_global_zero:
@@ -114,53 +114,41 @@ def _finished_before(run: RunConfig, folder: Path) -> FitResult | None:
     return FitResult(folder, folder / finished.checkpoint, finished.steps, 0.0, {})
 
 
-def _start(cfg: DictConfig, run: RunConfig) -> tuple[Reconstruction, Path | None, str | None]:
-    """Return the module with its starting weights, the checkpoint to resume, and the path of the parent."""
-    last = Path(run.output_dir) / LAST
-    if run.resume != "none" and last.is_file():
-        card = read_checkpoint(last)
+def _start(cfg: DictConfig, run: RunConfig) -> tuple[Reconstruction, Path | None, dict[str, Any] | None]:
+    """Return the module with its weights, the checkpoint to resume, and what is known of the parent."""
+    found = _to_continue(run)
+    if found is not None:
+        path, content = found
         module = build_module(cfg, build_model(cfg, pretrained=False))
-        if card["stage"] != module.stage.name:
+        if content["stage"] != module.stage.name:
             raise CheckpointError(
-                f"{last} is of stage {card['stage']}, not {module.stage.name}: choose the experiment "
-                f"that wrote it, or start a new run from its weights with init_from={last}"
+                f"{path} is of stage {content['stage']}, not {module.stage.name}: choose the experiment "
+                f"that wrote it, or start a new run from its weights with init_from={path}"
             )
-        _log.info("continuing from step %d of %s", card["global_step"], last)
-        return module, last, card["parent"]
-    if run.resume not in ("none", "auto"):
-        raise CheckpointError(f"no checkpoint at {run.resume}: give the path of a last.ckpt, or resume=auto")
-    if run.resume == "auto":
-        _log.info("nothing to continue: this is a new run")
-    parent = find_parent(run, _stage(cfg))
-    module = build_module(cfg, build_model(cfg, pretrained=parent is None))
-    if parent is None:
-        return module, None, None
-    checkpoint = read_checkpoint(parent)
-    if checkpoint["stage"] not in (module.stage.parent, module.stage.name):
-        _log.warning("%s is of stage %s, expected %s", parent, checkpoint["stage"], module.stage.parent)
-    load_weights(module.model, checkpoint, parent)
-    _log.info("starting from stage %s: %s", checkpoint["stage"], parent)
-    return module, None, str(parent)
+        load_weights(module.model, content, path)
+        _log.info("continuing from step %d of %s", content.get("global_step", 0), path)
+        return module, path, content.get("parent")
+    stage = _stage(cfg)
+    start = find_parent(run, stage)
+    if start is None:
+        return build_module(cfg, build_model(cfg)), None, None
+    content = read_checkpoint(start)
+    parent = Parent.of(start, content)
+    check_parent(parent, stage, refuse=run.check_parent)
+    module = build_module(cfg, build_model(cfg, pretrained=False))
+    load_weights(module.model, content, start)
+    return module, None, parent.as_plain()
 
 
-def find_parent(run: RunConfig, stage: Stage) -> Path | None:
-    """Return the checkpoint whose weights a new run starts from, None to start from scratch.
-
-    Raises:
-        ConfigError: ``init_from=auto`` finds no finished run of the parent stage.
-    """
-    if run.init_from not in ("auto", "none"):
-        return Path(run.init_from)
-    if run.init_from == "none" or stage.parent is None:
+def _to_continue(run: RunConfig) -> tuple[Path, dict[str, Any]] | None:
+    """Return the checkpoint to go on from and its content, None for a new run."""
+    if run.resume == "none":
         return None
-    found = newest_finished(Path(run.outputs), preset=run.preset, stage=stage.parent)
+    if run.resume != "auto":
+        return Path(run.resume), read_checkpoint(Path(run.resume))
+    found = read_newest((Path(run.output_dir) / LAST).parent)
     if found is None:
-        raise ConfigError(
-            f"no finished run of stage {stage.parent} with preset {run.preset} under "
-            f"{Path(run.outputs).resolve()}: run `python -m raytran.train "
-            f"experiment={stage.parent_experiment} preset={run.preset}` first, "
-            "or give init_from=CHECKPOINT, or init_from=none to start from scratch"
-        )
+        _log.info("nothing to continue: this is a new run")
     return found
 
 

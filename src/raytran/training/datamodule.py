@@ -4,14 +4,17 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
+import torch
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
+from raytran.data.augment import Augmentation
 from raytran.data.collate import collate_scenes
+from raytran.training.scene_stream import SceneStream
 from raytran.types import SceneBatch
 
 _log = logging.getLogger(__name__)
@@ -22,7 +25,8 @@ class SceneDataModule(pl.LightningDataModule):
 
     Args:
         root: folder with ``scannet``, ``scan2cad`` and ``shapenet``.
-        dataset: ``dataset(root=…, split="train"|"val", view_choice=…, num_views=…, targets=…)``.
+        dataset: ``dataset(root=…, split="train"|"val", view_choice=…, num_views=…, targets=…,
+            augmentation=…)``.
         targets: what batches must hold, see ``SceneDataset``.
         make: ``make(output=root)`` writes the data and does nothing where they are complete; None if they are
             there in any case.
@@ -30,6 +34,7 @@ class SceneDataModule(pl.LightningDataModule):
         val_views: frames of a validation scene, evenly spread.
         batch_size: scenes per device.
         num_workers: loader processes.
+        augmentation: random changes of training scenes; validation scenes are never changed.
         seed: of the order of the scenes.
     """
 
@@ -44,6 +49,7 @@ class SceneDataModule(pl.LightningDataModule):
         val_views: int = 20,
         batch_size: int = 1,
         num_workers: int = 2,
+        augmentation: Augmentation | None = None,
         seed: int = 0,
     ) -> None:
         super().__init__()
@@ -55,7 +61,9 @@ class SceneDataModule(pl.LightningDataModule):
         self._val_views = val_views
         self._batch_size = batch_size
         self._num_workers = num_workers
+        self._augmentation = augmentation
         self._seed = seed
+        self._place = {"scenes": 0, "step": 0}
 
     def prepare_data(self) -> None:
         """Make the data; Lightning calls this on one process and lets the others wait."""
@@ -63,19 +71,39 @@ class SceneDataModule(pl.LightningDataModule):
             self._make(output=self.root)
 
     def split(self, split: str, *, training: bool = False) -> Dataset[SceneBatch]:
-        """Return the scenes of ``train`` or ``val``; with random views for training, else even ones."""
+        """Return the scenes of ``train`` or ``val``; for training with random views and augmented."""
         return self._dataset(
             root=self.root,
             split=split,
             targets=self._targets,
             view_choice="random" if training else "even",
             num_views=self._num_views if training else self._val_views,
+            augmentation=self._augmentation if training else None,
         )
 
+    def state_dict(self) -> dict[str, Any]:
+        """Return the place in the stream of scenes after the last whole step, for the checkpoint."""
+        if self.trainer is None:
+            return dict(self._place)
+        steps = self.trainer.global_step - self._place["step"]
+        a_step = self.trainer.accumulate_grad_batches * self.trainer.world_size * self._batch_size
+        return {"scenes": self._place["scenes"] + steps * a_step, "step": self.trainer.global_step}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on at the place of a checkpoint, also with another number of ranks or another batch size."""
+        self._place = {name: int(state_dict[name]) for name in self._place}
+
     def train_dataloader(self) -> DataLoader[SceneBatch]:
-        """Return the training scenes in an order that changes every epoch."""
+        """Return the training scenes without end, in an order that changes every epoch."""
         dataset = _ByEpoch(self.split("train", training=True))
-        return self._loader(dataset, EpochSampler(dataset, **self._ranks(), seed=self._seed))
+        stream = SceneStream(
+            dataset,
+            **self._ranks(),
+            batch_size=self._batch_size,
+            seed=self._seed,
+            first=self._place["scenes"],
+        )
+        return self._loader(dataset, stream)
 
     def val_dataloader(self) -> DataLoader[SceneBatch]:
         """Return the validation scenes in order; on several ranks a few come twice, to make them even."""
@@ -91,20 +119,15 @@ class SceneDataModule(pl.LightningDataModule):
             persistent_workers=self._num_workers > 0,
             collate_fn=collate_scenes,
             pin_memory=self.trainer is not None and self.trainer.strategy.root_device.type == "cuda",
+            # A loader draws a seed for its workers whenever it is asked anew. From a source of its own, so
+            # that a resumed run, whose loaders are new, draws the same numbers elsewhere.
+            generator=torch.Generator().manual_seed(self._seed),
         )
 
     def _ranks(self) -> dict[str, Any]:
         if self.trainer is None:
             return {"num_replicas": 1, "rank": 0}
         return {"num_replicas": self.trainer.world_size, "rank": self.trainer.global_rank}
-
-
-class EpochSampler(DistributedSampler[Any]):
-    """Gives (epoch, index) pairs: worker processes that live on learn which epoch they draw frames for."""
-
-    def __iter__(self) -> Iterator[Any]:
-        """Yield the pairs of this rank."""
-        return ((self.epoch, index) for index in super().__iter__())
 
 
 class _ByEpoch(Dataset[SceneBatch]):

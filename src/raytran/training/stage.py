@@ -20,6 +20,8 @@ class Stage:
         name: ``occupancy``, ``joint``, ``shape``, …
         parent: name of the stage whose weights this one starts from, None for the first.
         parent_experiment: the experiment that trains the parent, to be named in messages.
+        parent_score: validation score by which the parent has learned its task, e.g. ``occupancy/iou``.
+        parent_minimum: what that score must exceed for this stage to start.
         tasks: heads to run.
         terms: loss terms to minimise.
         targets: what the data set must provide.
@@ -30,6 +32,8 @@ class Stage:
     name: str
     parent: str | None
     parent_experiment: str | None
+    parent_score: str | None
+    parent_minimum: float
     tasks: Sequence[str]
     terms: Sequence[str]
     targets: Sequence[str]

@@ -9,7 +9,8 @@ import pytest
 
 from raytran.data.rooms.furnish import Furnisher
 from raytran.data.rooms.layout import Layout
-from raytran.data.rooms.placed import FLOOR, ModelPool
+from raytran.data.rooms.placed import FLOOR
+from raytran.data.rooms.pool import ModelPool
 from raytran.data.rooms.room import make_room
 from raytran.types import CLASSES
 

@@ -56,7 +56,7 @@ def test_a_broken_off_run_is_finished(made, tmp_path):
     shutil.copytree(root, copy)
     scans = copy / "scannet" / "scans"
     shutil.rmtree(scans / "scene0001_00")
-    (scans / ".scene0001_00.123.tmp" / "color").mkdir(parents=True)
+    (scans / ".unfinished-scene0001_00.123" / "color").mkdir(parents=True)
     (copy / "scan2cad" / "full_annotations.json").unlink()
     report = generate_rooms(copy, num_train=2, num_val=1, processes=1, **SMALL)
     assert report.made == 1

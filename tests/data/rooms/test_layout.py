@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from raytran.data.rooms.layout import MAX_TILT, Layout
-from raytran.data.rooms.placed import FLOOR, ModelPool, upright_rotation, yaw_facing
+from raytran.data.rooms.placed import FLOOR, upright_rotation, yaw_facing
+from raytran.data.rooms.pool import ModelPool
 from raytran.data.rooms.room import make_room
 from raytran.geometry.boxes import OrientedBoxes, box_iou
 

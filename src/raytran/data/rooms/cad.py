@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,6 +126,7 @@ class CadModel:
         size_m: ``(3,)`` real size along the object's axes, metres; one factor scales ``vertices`` to it.
         support: where it stands: ``floor``, ``wall`` (on the floor, its back +Z to a wall), ``table`` (on a
             table, desk or low cabinet) or ``bed`` (on a bed or sofa).
+        source: folder in ShapeNet's layout that it was read from; None for a generated model.
     """
 
     catid: str
@@ -138,6 +140,7 @@ class CadModel:
     symmetry: int
     size_m: NDArray[np.float64]
     support: str
+    source: Path | None = None
 
 
 def sample_model(category: str, rng: np.random.Generator) -> CadModel:

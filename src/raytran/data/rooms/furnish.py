@@ -10,7 +10,8 @@ import numpy as np
 
 from raytran.data.rooms.cad import CadModel
 from raytran.data.rooms.layout import Layout
-from raytran.data.rooms.placed import ModelPool
+from raytran.data.rooms.pool import ModelPool
+from raytran.types import CLASSES
 
 ROOM_KINDS = {
     "office": 0.26,
@@ -40,6 +41,16 @@ _OTHERS = {
     "lamp": ("floor lamp", "table lamp"),
     "pillow": ("pillow",),
 }
+_GIVEN: dict[str, dict[str, float]] = {
+    "office": {"file cabinet": 2, "flowerpot": 2, "laptop": 1, "bench": 0.5},
+    "living": {"piano": 1, "flowerpot": 2, "speaker": 1, "basket": 0.5},
+    "bedroom": {"crib": 0.5, "bunk bed": 0.5, "flowerpot": 1, "basket": 1, "laptop": 0.5},
+    "dining": {"stove": 1, "microwave": 1, "bench": 1, "flowerpot": 2},
+    "meeting": {"flowerpot": 2, "laptop": 2, "speaker": 1},
+    "bathroom": {"washing machine": 2, "basket": 2, "flowerpot": 1},
+}
+"""Kinds in the class ``other`` that are placed only if given CAD models have them."""
+
 _MOST = {"trashbin": 2, "lamp": 3, "sofa": 2, "printer": 2, "pillow": 4}
 
 
@@ -65,7 +76,8 @@ class Furnisher:
     def furnish(self) -> None:
         """Place the groups that make the room what it is, then single pieces until the number is reached."""
         _GROUPS[self.layout.room.kind](self)
-        weights = _EXTRAS[self.layout.room.kind]
+        given = {kind: share for kind, share in _GIVEN[self.layout.room.kind].items() if self.pool.has(kind)}
+        weights = _EXTRAS[self.layout.room.kind] | given
         names, share = list(weights), np.array(list(weights.values())) / sum(weights.values())
         for _ in range(4 * self.wanted):
             if self.room_left <= 0:
@@ -75,9 +87,9 @@ class Furnisher:
     def extra(self, name: str) -> None:
         """Place one more piece; nothing happens if it finds no place."""
         rng, layout = self.layout.rng, self.layout
-        kinds = _OTHERS.get(name, ())
+        kinds = _OTHERS.get(name, () if name in CLASSES else (name,))
         present = [o for o in layout.objects if o.model.category == name or o.model.kind in kinds]
-        if len(present) >= _MOST.get(name, self.wanted):
+        if len(present) >= _MOST.get(name, self.wanted if name in CLASSES else 2):
             return
         model = self.draw("other", *kinds) if kinds else self.draw(name)
         if model is None:

@@ -3,32 +3,34 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import multiprocessing
-import os
-import shutil
-import signal
+import logging
 import time
 from collections import Counter
-from collections.abc import Iterator
-from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
-from dataclasses import asdict, dataclass
-from itertools import islice
+from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from raytran.data.atomic import UNFINISHED, sweep, write_text
+from raytran.data.rooms.library import digest_of, list_models, read_library, survey, write_library
+from raytran.data.rooms.pool import ModelPool
 from raytran.data.rooms.scene import RoomSettings, make_scene
-from raytran.data.rooms.write import annotation_path, write_scene, write_text
+from raytran.data.rooms.write import annotation_path, write_scene
+from raytran.data.workers import work_on
 from raytran.errors import ConfigError, DataError
+
+_log = logging.getLogger(__name__)
 
 FORMAT = "raytran.rooms/1"
 """Rises when the same seed no longer gives the same rooms."""
 
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+_CADS = "cads.json"
+
+_NOTICES = ("credits.csv", "LICENCES.txt")
+"""Files beside CAD models that must go where the models go."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,7 @@ class RoomsReport:
         made: scans made by this call; the others were there already.
         objects: objects in all scans together.
         seconds: wall-clock time.
+        cads_left_out: ``catid/id`` of given CAD models that cannot be used, with the reason.
     """
 
     root: Path
@@ -50,6 +53,7 @@ class RoomsReport:
     made: int
     objects: int
     seconds: float
+    cads_left_out: dict[str, str] = field(default_factory=dict)
 
 
 def generate_rooms(
@@ -63,13 +67,15 @@ def generate_rooms(
     min_objects: int = 3,
     max_objects: int = 30,
     room_size: tuple[tuple[float, float], tuple[float, float]] = ((3.0, 7.0), (3.0, 6.0)),
+    cads: Path | None = None,
     processes: int = 0,
     progress: bool = True,
 ) -> RoomsReport:
     """Make a data set of furnished rooms, or finish one that was begun.
 
-    Each scene follows from ``seed`` and its number alone. A scan whose folder carries its final name is done;
-    calling again makes what is missing. An interrupt lets rooms in work end and leaves nothing half-written.
+    Each scene follows from ``seed``, its number and the models in ``cads`` alone. A scan whose folder carries
+    its final name is done; calling again makes what is missing. An interrupt lets rooms in work end and
+    leaves nothing half-written.
 
     Args:
         output: folder that gets ``scannet/``, ``shapenet/``, ``scan2cad/`` and ``rooms.json``.
@@ -81,33 +87,76 @@ def generate_rooms(
         min_objects: least number of objects in a room.
         max_objects: greatest number of objects in a room.
         room_size: ranges of the two sides of the floor, metres.
+        cads: folder in ShapeNet's layout to furnish with; None for generated models. Training and held-out
+            rooms get different models. What it lacks, such as a class, is generated; ``cads.json`` tells
+            which models are used, which are not and why.
         processes: worker processes, 0 for one per core; 1 works in this process.
         progress: show a progress bar.
 
     Raises:
         ConfigError: the numbers contradict each other.
-        DataError: ``output`` holds rooms that were made with other settings.
+        DataError: ``output`` holds rooms that were made with other settings, or ``cads`` holds no model that
+            can be used.
     """
-    started = time.monotonic()
     settings = RoomSettings(seed, frames, image_size, min_objects, max_objects, room_size)
     _check(settings, num_train, num_val)
-    output = Path(output).resolve()
-    _claim(output, {"format": FORMAT, "num_train": num_train, "num_val": num_val, **asdict(settings)})
+    cads = None if cads is None else Path(cads).resolve()
+    return _generate(Path(output).resolve(), settings, (num_train, num_val), cads, processes, progress)
+
+
+def _generate(
+    output: Path,
+    settings: RoomSettings,
+    numbers: tuple[int, int],
+    cads: Path | None,
+    processes: int,
+    progress: bool,
+) -> RoomsReport:
+    started = time.monotonic()
+    num_train, num_val = numbers
+    asked = {"format": FORMAT, "num_train": num_train, "num_val": num_val, **asdict(settings)}
+    _claim(output, asked if cads is None else asked | {"cads": digest_of(list_models(cads))})
+    left_out = {} if cads is None else _look_through(output, cads, processes, progress)
     scan_ids = [f"scene{number:04d}_00" for number in range(num_train + num_val)]
     scans = output / "scannet" / "scans"
     scans.mkdir(parents=True, exist_ok=True)
-    _sweep(scans)
+    sweep(scans, f"{UNFINISHED}*")
     missing = [number for number, scan_id in enumerate(scan_ids) if not (scans / scan_id).is_dir()]
-    _make_all(output, settings, missing, processes, progress)
+    make = partial(make_room_scan, output, settings, num_train=num_train, cads=cads)
+    for _ in work_on(missing, make, label="rooms", processes=processes, progress=progress):
+        pass
     objects = _write_lists(output, scan_ids, num_train)
     train, val = tuple(scan_ids[:num_train]), tuple(scan_ids[num_train:])
-    return RoomsReport(output, train, val, len(missing), objects, time.monotonic() - started)
+    return RoomsReport(output, train, val, len(missing), objects, time.monotonic() - started, left_out)
 
 
-def make_room_scan(output: Path, settings: RoomSettings, number: int) -> int:
+def make_room_scan(
+    output: Path, settings: RoomSettings, number: int, *, num_train: int, cads: Path | None = None
+) -> int:
     """Make and write the scan with this number; return how many objects it has."""
     rng = np.random.default_rng([settings.seed, number])
-    return write_scene(make_scene(settings, rng), scan_id=f"scene{number:04d}_00", root=output, rng=rng)
+    library = None if cads is None else read_library(output / _CADS, cads)
+    pool = ModelPool(settings.seed, library, "train" if number < num_train else "val")
+    scene = make_scene(settings, rng, pool)
+    return write_scene(scene, scan_id=f"scene{number:04d}_00", root=output, rng=rng)
+
+
+def _look_through(output: Path, cads: Path, processes: int, progress: bool) -> dict[str, str]:
+    """Write ``cads.json`` unless it is there; return which models cannot be used, and why."""
+    path = output / _CADS
+    if not path.is_file():
+        write_library(survey(cads, processes=processes, progress=progress), path)
+    for name in _NOTICES:
+        if (cads / name).is_file():
+            write_text(output / "shapenet" / name, (cads / name).read_text(encoding="utf-8"))
+    library = read_library(path, cads)
+    if library.left_out:
+        name, why = next(iter(library.left_out.items()))
+        _log.warning(
+            "%d of %d CAD models are not used; %s names them, the first is %s: %s",
+            *(len(library.left_out), len(library.left_out) + len(library.models), path, name, why),
+        )
+    return library.left_out
 
 
 def _check(settings: RoomSettings, num_train: int, num_val: int) -> None:
@@ -134,7 +183,7 @@ def _claim(output: Path, asked: dict[str, Any]) -> None:
             found = json.loads(path.read_text(encoding="utf-8"))
         except ValueError:
             found = {}
-        different = [key for key in asked if found.get(key) != asked[key]]
+        different = [key for key in {"cads": None} | asked if found.get(key) != asked.get(key)]
         if different:
             raise DataError(
                 f"{path} describes rooms made with other settings ({', '.join(different)}); "
@@ -142,60 +191,6 @@ def _claim(output: Path, asked: dict[str, Any]) -> None:
             )
         return
     write_text(path, json.dumps(asked, indent=2) + "\n")
-
-
-def _sweep(scans: Path) -> None:
-    """Remove what an earlier call that was killed left unfinished."""
-    for folder in scans.glob(".scene*.tmp"):
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _make_all(
-    output: Path, settings: RoomSettings, numbers: list[int], processes: int, progress: bool
-) -> None:
-    workers = min(processes or os.cpu_count() or 1, len(numbers))
-    columns = (TextColumn("rooms"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, disable=not progress or not numbers) as bar:
-        task = bar.add_task("rooms", total=len(numbers))
-        if workers <= 1:
-            for number in numbers:
-                make_room_scan(output, settings, number)
-                bar.advance(task)
-            return
-        with _one_thread_each(), _pool(workers) as pool:
-            # No more is handed out than is worked on, so that an interrupt waits for rooms in work only.
-            waiting = iter(numbers)
-            running = {pool.submit(make_room_scan, output, settings, n) for n in islice(waiting, workers)}
-            while running:
-                done, running = wait(running, return_when=FIRST_COMPLETED)
-                for future in done:
-                    future.result()
-                    bar.advance(task)
-                    running |= {pool.submit(make_room_scan, output, settings, n) for n in islice(waiting, 1)}
-
-
-def _pool(workers: int) -> ProcessPoolExecutor:
-    context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(workers, mp_context=context, initializer=_leave_interrupts_to_parent)
-
-
-def _leave_interrupts_to_parent() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-@contextlib.contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Let processes started inside use one thread each."""
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def _write_lists(output: Path, scan_ids: list[str], num_train: int) -> int:

@@ -1,21 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A CAD model that stands somewhere in a room, and the pool that models are drawn from."""
+"""A CAD model that stands somewhere in a room."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from raytran.data.rooms.cad import CadModel, sample_model
+from raytran.data.rooms.cad import CadModel
 from raytran.data.rooms.collision import Boxes
-from raytran.types import CLASSES
-
-MODELS_PER_CLASS = 100
-"""Models of one class that the rooms of one seed share, as scans share the CAD models of Scan2CAD."""
 
 FLOOR = -1
 """Parent of an object that stands on the floor."""
@@ -77,30 +72,3 @@ def upright_rotation(yaw: float) -> NDArray[np.float64]:
 def yaw_facing(direction: NDArray[np.float64]) -> float:
     """Return the yaw at which an object's front (-Z) looks along a horizontal ``direction`` ``(2,)``."""
     return float(np.arctan2(-direction[0], direction[1]))
-
-
-@dataclass(frozen=True)
-class ModelPool:
-    """The CAD models that all rooms of one seed draw from.
-
-    Attributes:
-        seed: seed of the rooms.
-    """
-
-    seed: int
-
-    def draw(
-        self, category: str, rng: np.random.Generator, *, kinds: Collection[str] = ()
-    ) -> CadModel | None:
-        """Draw a model of a class, if ``kinds`` is not empty of one of these kinds; None if none is found."""
-        for number in rng.integers(MODELS_PER_CLASS, size=60):
-            model = _pool_model(self.seed, category, int(number))
-            if not kinds or model.kind in kinds:
-                return model
-        return None
-
-
-@lru_cache(maxsize=2048)
-def _pool_model(seed: int, category: str, number: int) -> CadModel:
-    # Scenes are seeded by two numbers, models by three: the streams never meet.
-    return sample_model(category, np.random.default_rng([seed, CLASSES.index(category), number]))

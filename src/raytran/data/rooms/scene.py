@@ -14,7 +14,8 @@ from raytran.data.rooms.collision import Boxes
 from raytran.data.rooms.furnish import ROOM_KINDS, Furnisher
 from raytran.data.rooms.layout import Layout
 from raytran.data.rooms.materials import texture_index
-from raytran.data.rooms.placed import FLOOR, ModelPool, PlacedObject
+from raytran.data.rooms.placed import FLOOR, PlacedObject
+from raytran.data.rooms.pool import ModelPool
 from raytran.data.rooms.render import Pinhole, Renderer
 from raytran.data.rooms.room import Room, make_room
 from raytran.data.rooms.surfaces import Paint, Surfaces
@@ -63,13 +64,18 @@ class Scene:
     scan_from_room: NDArray[np.float64]
 
 
-def make_scene(settings: RoomSettings, rng: np.random.Generator) -> Scene:
+def make_scene(settings: RoomSettings, rng: np.random.Generator, pool: ModelPool | None = None) -> Scene:
     """Draw a scene in which every object is seen in several frames.
+
+    Args:
+        settings: what all rooms have in common.
+        rng: source of all choices.
+        pool: where the furniture comes from; None for generated models.
 
     Raises:
         ConfigError: no such scene was found, as when many objects are asked of a tiny room.
     """
-    pool = ModelPool(settings.seed)
+    pool = pool or ModelPool(settings.seed)
     for _ in range(_ATTEMPTS):
         layout = _furnished(settings, pool, rng)
         scene = _filmed(settings, layout, rng) if len(layout.objects) >= settings.min_objects else None

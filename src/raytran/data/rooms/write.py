@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import json
-import os
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +12,11 @@ from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 from scipy.spatial.transform import Rotation
 
+from raytran.data.atomic import finished_folder, write_text
 from raytran.data.rooms.placed import PlacedObject
 from raytran.data.rooms.scene import Scene
-from raytran.data.shapenet import write_model
+from raytran.data.shapenet import copy_model
+from raytran.data.shapenet_write import write_model
 
 FRAME_STEP = 10
 """Distance of the written frames' numbers, as in exports that keep every tenth frame of a video."""
@@ -37,40 +37,25 @@ def write_scene(scene: Scene, *, scan_id: str, root: Path, rng: np.random.Genera
     Returns:
         the number of objects.
     """
-    for placed in scene.objects:
-        write_model(placed.model, root / "shapenet")
+    for model in (placed.model for placed in scene.objects):
+        if model.source is None:
+            write_model(model, root / "shapenet")
+        else:
+            copy_model(model.source, model.catid, model.model_id, root / "shapenet")
     annotation = annotate(scene, scan_id=scan_id, rng=rng)
     write_text(annotation_path(root, scan_id), json.dumps(annotation))
     scans = root / "scannet" / "scans"
-    folder = scans / f".{scan_id}.{os.getpid()}.tmp"
-    try:
-        shutil.rmtree(folder, ignore_errors=True)
-        (folder / "color").mkdir(parents=True)
-        (folder / "pose").mkdir()
-        (folder / "intrinsic").mkdir()
+    with finished_folder(scans / scan_id) as folder:
+        for name in ("color", "pose", "intrinsic"):
+            (folder / name).mkdir()
         count = _write_frames(scene, folder, rng)
         _write_scan_facts(scene, folder, scan_id, count)
-        os.replace(folder, scans / scan_id)
-    except OSError:
-        # Another process may have finished the same scan, of the same bytes, meanwhile.
-        if not (scans / scan_id).is_dir():
-            raise
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
     return len(scene.objects)
 
 
 def annotation_path(root: Path, scan_id: str) -> Path:
     """Return the file that holds one scan's entry of ``full_annotations.json``."""
     return root / "scan2cad" / "scans" / f"{scan_id}.json"
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file under its name only when it is complete."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    temporary.write_text(text, encoding="utf-8")
-    os.replace(temporary, path)
 
 
 def annotate(scene: Scene, *, scan_id: str, rng: np.random.Generator) -> dict[str, Any]:

@@ -1,28 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keeps one resumable checkpoint: every N steps, at the end, and when the user interrupts."""
+"""Keeps one resumable checkpoint: every N steps, at the end, and when the run is asked to stop."""
 
 from __future__ import annotations
 
 import logging
-import signal
-import threading
 from collections.abc import Mapping
 from pathlib import Path
-from types import FrameType
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import lightning.pytorch as pl
-from lightning.pytorch.utilities.exceptions import SIGTERMException
+
+from raytran.errors import CheckpointError
+from raytran.training.callbacks.stop_signals import StopRequestedError, StopSignals
+from raytran.training.checkpoint_io import AtomicCheckpointIO
+from raytran.training.checkpoint_resume import loop_state, random_states, set_random_states
 
 _log = logging.getLogger(__name__)
 
 
-class LastCheckpoint(pl.Callback):
-    """Writes ``path`` and puts the run's card into it.
+@runtime_checkable
+class ContinuedLogger(Protocol):
+    """A logger whose record can be taken back to a step."""
 
-    The first Ctrl-C lets the step in hand finish, so that the weights on disk are those of a whole step; a
-    second one stops at once and leaves the last periodic checkpoint. With several processes a rank cannot
-    know at which step the others stop, so there only the periodic checkpoint remains.
+    def continue_from(self, step: int) -> None:
+        """Forget what was logged at ``step`` and later: the run does these steps again."""
+
+
+class LastCheckpoint(pl.Callback):
+    """Writes ``path``, puts the run's card into it, and continues a run from it exactly.
+
+    A checkpoint is the state between two steps: after the validation that may follow the first, before the
+    second. A run asked to stop during a long validation does not wait for its end; the validation is then
+    done anew when the run is resumed.
 
     Args:
         path: the file to write.
@@ -34,55 +43,123 @@ class LastCheckpoint(pl.Callback):
         self._path = path
         self._every_n_steps = every_n_steps
         self._card = dict(card)
-        self._interrupted = False
+        self._signals = StopSignals()
         self._written_at = -1
-        self._earlier_handler: Any = None
+        self._tried_at = -1
+        self._scores: dict[str, float] = {}
+        self._random: dict[str, Any] | None = None  # as it was before the validation that goes on
+        self._resumed: dict[str, Any] | None = None
 
     def on_save_checkpoint(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Add the card."""
+        """Add the card, the scores of the last validation and what an exact resume needs."""
+        states = self._random or random_states(pl_module.device)
         checkpoint.update(self._card)
+        checkpoint["scores"] = dict(self._scores)
+        checkpoint["resume"] = {
+            "validation_due": self._random is not None,
+            "random": self._signals.gather(states),
+        }
 
-    def on_fit_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Listen for Ctrl-C."""
-        self._written_at = trainer.global_step
-        if trainer.world_size == 1 and threading.current_thread() is threading.main_thread():
-            self._earlier_handler = signal.signal(signal.SIGINT, self._on_interrupt)
+    def on_load_checkpoint(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Set Lightning's counters to what the checkpoint means; remember the rest for the first step."""
+        resumed, step = checkpoint.get("resume"), checkpoint.get("global_step")
+        if not isinstance(resumed, dict) or not isinstance(step, int) or "optimizer_states" not in checkpoint:
+            raise CheckpointError(
+                f"{self._path} holds weights but no state of training: start a new run with init_from="
+            )
+        self._resumed = resumed
+        self._scores = dict(checkpoint.get("scores", {}))
+        del checkpoint["loops"]
+        if step > 0:
+            checkpoint["loops"] = loop_state(
+                step,
+                accumulate=trainer.accumulate_grad_batches,
+                validation_due=bool(resumed["validation_due"]),
+            )
 
-    def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *_: Any) -> None:
-        """Write every N steps, and before stopping at the user's wish."""
-        if self._interrupted or trainer.global_step - self._written_at >= self._every_n_steps:
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Listen for signals; if resumed, continue the random numbers and the logs."""
+        self._signals.listen(trainer.world_size)
+        self._written_at = self._tried_at = trainer.global_step
+        for logger in trainer.loggers:
+            if isinstance(logger, ContinuedLogger):
+                logger.continue_from(trainer.global_step)
+        if self._resumed is None:
+            return
+        steps = self._signals.gather(trainer.global_step)
+        if len(set(map(str, steps))) > 1:
+            raise CheckpointError(
+                f"the ranks found checkpoints of different steps ({steps}) in {self._path.parent}: "
+                "wait until all nodes see the same files, then try again"
+            )
+        states = self._resumed["random"]
+        if len(states) == trainer.world_size:
+            set_random_states(states[trainer.global_rank], pl_module.device)
+        else:
+            _log.warning(
+                "the run had %d ranks and has %d now: it continues, but not with the same random numbers",
+                len(states),
+                trainer.world_size,
+            )
+
+    def on_train_batch_start(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, batch: Any, batch_idx: int
+    ) -> None:
+        """Between two steps: write every N steps, and before stopping where that is asked for."""
+        if batch_idx % trainer.accumulate_grad_batches:
+            return
+        signum = self._signals.agreed()
+        if signum or trainer.global_step - self._tried_at >= self._every_n_steps:
             self._write(trainer)
-        if self._interrupted:
-            raise KeyboardInterrupt
+        if signum:
+            self._stop(signum)
+
+    def on_validation_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Remember where the random numbers were, should the validation be cut short."""
+        self._random = random_states(pl_module.device)
+
+    def on_validation_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *_: Any) -> None:
+        """Stop in a long validation too, unless it is the last: a run that has all its steps just ends."""
+        if trainer.global_step != trainer.max_steps and (signum := self._signals.agreed()):
+            self._write(trainer)
+            self._stop(signum)
+
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Take down the scores, which later stages ask for."""
+        self._random = None
+        scores = {name: float(value) for name, value in trainer.callback_metrics.items()}
+        self._scores = {name: value for name, value in scores.items() if name.startswith("val/")}
+        self._scores["step"] = trainer.global_step
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Write the final checkpoint."""
+        """Write the final checkpoint.
+
+        Raises:
+            CheckpointError: it cannot be written.
+        """
         if trainer.global_step != self._written_at or not self._path.is_file():
             self._write(trainer)
-
-    def on_exception(
-        self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException
-    ) -> None:
-        """Write if the machine asked to stop (Lightning raises between two batches); say how to go on."""
-        if isinstance(exception, SIGTERMException) and trainer.world_size == 1:
-            self._write(trainer)
-        if isinstance(exception, KeyboardInterrupt | SIGTERMException):
-            _log.info("stopped; resume=auto continues from step %d", max(0, self._written_at))
-
-    def teardown(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
-        """Stop listening."""
-        if self._earlier_handler is not None:
-            signal.signal(signal.SIGINT, self._earlier_handler)
-            self._earlier_handler = None
+        error = self._write_error(trainer)
+        if error is not None:
+            raise error
 
     def _write(self, trainer: pl.Trainer) -> None:
         trainer.save_checkpoint(self._path)
-        self._written_at = trainer.global_step
+        self._tried_at = trainer.global_step
+        error = self._write_error(trainer)
+        if error is None:
+            self._written_at = trainer.global_step
+        else:
+            _log.warning("%s; training goes on", error)
 
-    def _on_interrupt(self, signum: int, frame: FrameType | None) -> None:
-        if self._interrupted:
-            raise KeyboardInterrupt
-        self._interrupted = True
-        _log.info("stopping after this step; press Ctrl-C again to stop at once")
+    def _write_error(self, trainer: pl.Trainer) -> CheckpointError | None:
+        plugin = trainer.strategy.checkpoint_io
+        return plugin.error if isinstance(plugin, AtomicCheckpointIO) else None
+
+    def _stop(self, signum: int) -> None:
+        _log.info("stopped; resume=auto continues from step %d", max(0, self._written_at))
+        raise StopRequestedError(signum)

@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which scenes a data set has, and what it keeps of them in memory: objects of all, cameras of the latest."""
+
+from __future__ import annotations
+
+import pickle
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import torch
+
+from raytran.data.scan2cad import SceneAnnotation
+from raytran.data.scannet import Scan, read_scan
+from raytran.errors import DataError
+from raytran.types import ObjectSet
+
+
+def choose_scenes(
+    scans_root: Path,
+    wanted: Sequence[str] | None,
+    annotations: Mapping[str, SceneAnnotation] | None,
+) -> tuple[str, ...]:
+    """Return the scans to take.
+
+    Args:
+        scans_root: folder of the scans.
+        wanted: names of scans; if None all that are there and, if there are annotations, have objects.
+        annotations: of the scans; None if there are none at all.
+
+    Raises:
+        DataError: a scan or the folder is missing, or no scan is left.
+    """
+    if not scans_root.is_dir():
+        raise DataError(f"there is no folder {scans_root}: prepare the data set or mend its path")
+    present = {path.name for path in scans_root.iterdir() if path.is_dir()}
+    if wanted is None:
+        wanted = sorted(present if annotations is None else present & set(annotated(annotations)))
+        if not wanted:
+            which = "with objects in the annotation" if annotations is not None else "at all"
+            raise DataError(f"no scene {which} lies in {scans_root}: check that the paths belong together")
+    missing = [scene_id for scene_id in wanted if scene_id not in present]
+    if missing:
+        raise DataError(
+            f"{len(missing)} of {len(wanted)} scans are not in {scans_root}, the first is {missing[0]}: "
+            "add them or take them from the list"
+        )
+    return tuple(wanted)
+
+
+def annotated(annotations: Mapping[str, SceneAnnotation]) -> list[str]:
+    """Return the scenes that have at least one model."""
+    return [scene_id for scene_id, annotation in annotations.items() if annotation.model_id]
+
+
+def read_split(scannet: Path, split: str) -> list[str] | None:
+    """Return the scans of ``scannetv2_<split>.txt``, or None if there are no split files at all.
+
+    Raises:
+        DataError: there are others, but not this one.
+    """
+    path = scannet / f"scannetv2_{split}.txt"
+    if path.is_file():
+        return path.read_text(encoding="utf-8").split()
+    if any(scannet.glob("scannetv2_*.txt")):
+        raise DataError(f"there is no {path}: choose a split that has a file, or write its scans there")
+    return None
+
+
+class ObjectTable:
+    """The objects of many scenes in six tensors.
+
+    A tensor costs a file handle in each worker process that is not forked, so thousands of small ones would
+    not reach it.
+
+    Args:
+        scenes: objects without shapes.
+    """
+
+    def __init__(self, scenes: Sequence[ObjectSet]) -> None:
+        parts = [ObjectSet.empty(), *scenes]
+        names = ("label", "center", "size", "rotation", "symmetry", "score")
+        self._all = ObjectSet(
+            **{name: torch.cat([getattr(part, name) for part in parts]) for name in names},
+            model_id=tuple(model_id for part in parts for model_id in part.model_id),
+        )
+        self._ends = tuple(torch.tensor([len(part) for part in parts]).cumsum(0).tolist())
+
+    def __len__(self) -> int:
+        return len(self._ends) - 1
+
+    def __getitem__(self, index: int) -> ObjectSet:
+        """Return the objects of one scene, copied."""
+        return self._all.select(torch.arange(self._ends[index], self._ends[index + 1]))
+
+
+class RecentScans:
+    """Scans by name; those asked for last stay in memory, packed into about 0.2 kB a frame.
+
+    A copy for another process starts empty.
+
+    Args:
+        scans_root: folder of the scans.
+        max_bytes: most memory of all scans kept.
+    """
+
+    def __init__(self, scans_root: Path, max_bytes: int) -> None:
+        self._scans_root, self._max_bytes = scans_root, max_bytes
+        self._packed: OrderedDict[str, bytes] = OrderedDict()
+        self._bytes = 0
+
+    def __getitem__(self, scene_id: str) -> Scan:
+        """Return a scan.
+
+        Raises:
+            DataError: see ``read_scan``.
+        """
+        if scene_id in self._packed:
+            self._packed.move_to_end(scene_id)
+            unpacked: Scan = pickle.loads(self._packed[scene_id])
+            return unpacked
+        scan = read_scan(self._scans_root / scene_id)
+        self._packed[scene_id] = pickle.dumps(scan)
+        self._bytes += len(self._packed[scene_id])
+        while self._bytes > self._max_bytes:
+            self._bytes -= len(self._packed.popitem(last=False)[1])
+        return scan
+
+    def __len__(self) -> int:
+        """Return the number of scans in memory."""
+        return len(self._packed)
+
+    def __reduce__(self) -> tuple[type[RecentScans], tuple[Path, int]]:
+        return RecentScans, (self._scans_root, self._max_bytes)
