@@ -206,6 +206,7 @@ def test_a_job_that_outlives_its_launcher_keeps_the_sweep(sweep):
         ("launcher.resume=maybe", "unknown launcher.resume=maybe: choose auto or none"),
         ("trainer.num_nodes=2", "hydra/launcher=slurm"),
         ("sede=3", "there is no such setting"),
+        ("hydra.launcher._target_=hydra_plugins.absent.Launcher", "it is not installed; pip install"),
     ],
 )
 def test_a_mistake_is_one_sentence(sweep, word, message):
