@@ -99,12 +99,21 @@ def read_finished(folder: Path) -> Finished | None:
         ) from error
 
 
-def newest_finished(outputs: Path, *, preset: str, stage: str) -> Path | None:
-    """Return the checkpoint of the newest finished run of ``stage`` with ``preset``, if there is one."""
+def newest_finished(outputs: Path, *, preset: str, stage: str, experiment: str | None = None) -> Path | None:
+    """Return the checkpoint of the newest finished run of ``stage`` with ``preset``, if there is one.
+
+    Args:
+        outputs: top folder of all runs.
+        preset: the preset.
+        stage: name of the stage.
+        experiment: the experiment; None for any. Networks of two experiments may differ (a fourth channel).
+    """
     found = []
     for path in (outputs / preset).glob(f"**/{FINISHED}"):
         mark = read_finished(path.parent)
-        if mark is not None and (mark.stage, mark.preset) == (stage, preset):
+        if mark is None or (mark.stage, mark.preset) != (stage, preset):
+            continue
+        if experiment in (None, mark.experiment):
             checkpoint = path.parent / mark.checkpoint
             if checkpoint.is_file():
                 found.append((mark.time, checkpoint))

@@ -61,7 +61,9 @@ def find_parent(run: RunConfig, stage: Stage) -> Path | None:
         return Path(run.init_from)
     if run.init_from == "none" or stage.parent is None:
         return None
-    found = newest_finished(Path(run.outputs), preset=run.preset, stage=stage.parent)
+    found = newest_finished(
+        Path(run.outputs), preset=run.preset, stage=stage.parent, experiment=stage.parent_experiment
+    )
     if found is None:
         raise ConfigError(
             f"no finished run of stage {stage.parent} with preset {run.preset} under "
