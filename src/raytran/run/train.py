@@ -21,6 +21,7 @@ from raytran.errors import CheckpointError, ConfigError
 from raytran.run.build import build_data, build_model, build_module, build_trainer, plain
 from raytran.run.checkpoint import checkpoint_card, load_weights
 from raytran.run.folders import LAST, one_at_a_time, read_finished, write_finished
+from raytran.run.memory import explained_out_of_memory
 from raytran.run.parent import Parent, check_parent, find_parent
 from raytran.run.provenance import provenance
 from raytran.run.settings import RunConfig
@@ -84,7 +85,8 @@ def _train(cfg: DictConfig, run: RunConfig, folder: Path) -> FitResult:
         _log.info("%s", line)
     began = time.monotonic()
     try:
-        trainer.fit(module, data, ckpt_path=resume_from)
+        with explained_out_of_memory(cfg):
+            trainer.fit(module, data, ckpt_path=resume_from)
     except StopRequestedError as stop:
         # One rank tells the shell; Lightning and torchrun would take codes of the others for a crash.
         raise SystemExit(128 + stop.signum if trainer.is_global_zero else 0) from stop
