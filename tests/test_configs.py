@@ -159,6 +159,7 @@ def test_roots_resolve(root):
     [
         ("seed=many", "many"),
         ("checkpoint_every=0", "at least 1"),
+        ("check_parent=false", "choose one of scores, stage, none"),
         ("progress_bar=fancy", "choose one of rich, tqdm, none"),
     ],
 )

@@ -25,6 +25,10 @@ class CheckpointError(RaytranError):
     """A checkpoint is missing, damaged, or of the wrong stage."""
 
 
+class NonFiniteError(RaytranError):
+    """Training has lost itself: losses or gradients stay infinite or undefined."""
+
+
 class ShapeError(RaytranError, ValueError):
     """A tensor does not have the documented shape."""
 

@@ -46,7 +46,6 @@ def settings(rooms):
         "trainer.val_check_interval=2",
         "schedule.log_every=1",
         "checkpoint_every=2",
-        "check_parent=false",
     ]
 
 

@@ -4,14 +4,18 @@
 from __future__ import annotations
 
 import csv
+import errno
+import os
 import random
+import signal
 
 import numpy as np
 import pytest
 import torch
 
+from raytran.errors import CheckpointError, ConfigError
 from raytran.run.entry import compose
-from raytran.run.folders import LAST
+from raytran.run.folders import FINISHED, LAST, one_at_a_time
 from raytran.run.train import train
 from raytran.training.reconstruction import Reconstruction
 
@@ -110,3 +114,118 @@ def test_a_kill_anywhere(base, straight, tmp_path, monkeypatch, hook, call):
             fit(base, tmp_path / "run")
     fit(base, tmp_path / "run")
     assert_same(tmp_path / "run", straight)
+
+
+def send_at(monkeypatch, hook, call, signum):
+    """Send this process a signal within the ``call``-th call of a method of the module."""
+    original, calls = getattr(Reconstruction, hook), []
+
+    def counted(*arguments, **named):
+        calls.append(None)
+        if len(calls) == call:
+            os.kill(os.getpid(), signum)
+        return original(*arguments, **named)
+
+    monkeypatch.setattr(Reconstruction, hook, counted)
+
+
+@pytest.mark.parametrize(
+    ("hook", "call", "signum", "step", "validation_due"),
+    [
+        ("training_step", 4, signal.SIGTERM, 4, False),
+        ("training_step", 6, signal.SIGUSR1, 6, True),  # the validation after step 6 is not waited for
+        ("validation_step", 1, signal.SIGTERM, 3, True),
+        ("training_step", 1, signal.SIGINT, 1, False),
+    ],
+)
+def test_a_signal_saves_the_step_in_hand(
+    base, straight, tmp_path, monkeypatch, hook, call, signum, step, validation_due
+):
+    run = tmp_path / "run"
+    before = signal.getsignal(signum)
+    with monkeypatch.context() as context:
+        send_at(context, hook, call, signum)
+        with pytest.raises(SystemExit) as stopped:
+            fit(base, run)
+    assert stopped.value.code == 128 + signum
+    assert signal.getsignal(signum) == before
+    saved = torch.load(run / LAST, weights_only=True)
+    assert (saved["global_step"], saved["resume"]["validation_due"]) == (step, validation_due)
+    assert not (run / FINISHED).exists()
+    fit(base, run)
+    assert_same(run, straight)
+
+
+def test_a_signal_in_the_last_step_is_too_late(base, straight, tmp_path, monkeypatch):
+    with monkeypatch.context() as context:
+        send_at(context, "training_step", STEPS, signal.SIGTERM)
+        fit(base, tmp_path / "run")
+    assert_same(tmp_path / "run", straight)
+
+
+def test_steps_of_several_batches(base, tmp_path, monkeypatch):
+    """Three batches a step: a kill within a step goes back to its first batch."""
+    steps = [*base, "trainer.accumulate_grad_batches=3", "trainer.val_check_interval=6"]
+    fit(steps, tmp_path / "straight")
+    with monkeypatch.context() as context:
+        kill_at(context, "training_step", 15)
+        with pytest.raises(Killed):
+            fit(steps, tmp_path / "run")
+    assert torch.load(tmp_path / "run" / LAST, weights_only=True)["global_step"] == 4
+    fit(steps, tmp_path / "run")
+    assert_same(tmp_path / "run", tmp_path / "straight")
+
+
+def test_a_damaged_checkpoint_costs_some_steps_and_nothing_else(
+    base, straight, tmp_path, monkeypatch, caplog
+):
+    run = tmp_path / "run"
+    with monkeypatch.context() as context:
+        kill_at(context, "training_step", 8)
+        with pytest.raises(Killed):
+            fit(base, run)
+    (run / LAST).write_bytes((run / LAST).read_bytes()[:-1000])
+    fit(base, run)
+    assert "going on from the one before it" in caplog.text
+    assert_same(run, straight)
+
+
+def test_a_full_disk_does_not_stop_a_run_that_has_steps_to_go(base, straight, tmp_path, monkeypatch, caplog):
+    run, save = tmp_path / "run", torch.save
+
+    def refuse(content, file, **options):
+        if isinstance(content, dict) and content.get("global_step") in full:
+            file.write(b"half of it")
+            raise OSError(errno.ENOSPC, "No space left on device")
+        save(content, file, **options)
+
+    monkeypatch.setattr(torch, "save", refuse)
+    full = {4}
+    fit(base, run)
+    assert caplog.text.count("(No space left on device): make room there") == 1
+    assert_same(run, straight)
+
+    # At the end it cannot be hidden.
+    full, run = {6, STEPS}, tmp_path / "another"
+    with pytest.raises(CheckpointError, match="No space left on device"):
+        fit(base, run)
+    assert not (run / FINISHED).exists()
+    assert torch.load(run / LAST, weights_only=True)["global_step"] == 4
+    full = set()
+    fit(base, run)
+    assert_same(run, straight)
+
+
+def test_two_processes_do_not_train_in_one_folder(base, tmp_path):
+    with one_at_a_time(tmp_path / "run"), pytest.raises(ConfigError, match="another process trains in"):
+        fit(base, tmp_path / "run")
+
+
+def test_a_checkpoint_of_weights_alone_is_not_continued(base, straight, tmp_path):
+    content = torch.load(straight / LAST, weights_only=True)
+    for name in ("resume", "optimizer_states"):
+        del content[name]
+    (tmp_path / "run" / LAST).parent.mkdir(parents=True)
+    torch.save(content, tmp_path / "run" / LAST)
+    with pytest.raises(CheckpointError, match="no state of training: start a new run with init_from="):
+        fit(base, tmp_path / "run")

@@ -7,12 +7,14 @@ import csv
 import json
 from dataclasses import replace
 
+import pytest
 import torch
 from rich.console import Console
 from torch import nn
 
+from raytran.errors import ConfigError
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.run.evaluate import TASKS_WITH_SHAPE, evaluate_model, metrics_table
+from raytran.run.evaluate import TASKS_WITH_SHAPE, evaluate_model, metrics_table, with_at_most
 from raytran.types import ObjectSet, SceneBatch, ScenePrediction, Views
 
 
@@ -97,3 +99,18 @@ def test_shapes_are_left_alone_unless_asked_for():
     metrics = evaluate_model(model, [batch], progress=False)
     assert "shape" not in metrics
     assert model.thresholds == []
+
+
+class Counted(list):
+    """Scenes that are nothing but their number of objects."""
+
+    def num_objects(self, index):
+        return self[index]
+
+
+def test_scenes_with_few_objects_are_chosen():
+    scenes = Counted([12, 10, 31, 3])
+    assert list(with_at_most(10, scenes)) == [10, 3]
+    assert with_at_most(None, scenes) is scenes
+    with pytest.raises(ConfigError, match="choose a larger max_objects"):
+        with_at_most(2, scenes)

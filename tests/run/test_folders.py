@@ -88,3 +88,10 @@ def test_resume_decides_the_folder(tmp_path):
 def test_resume_from_a_loose_file_is_one_sentence(tmp_path):
     with pytest.raises(ConfigError, match=r"init_from=CHECKPOINT"):
         run_folder(str(tmp_path), "tiny", "stage1", "model.ckpt")
+
+
+def test_a_parent_is_a_run_of_the_experiment_that_was_asked_for(tmp_path):
+    run = make_run(tmp_path / "tiny" / "stage1" / "a", finished="2026-01-01")
+    asked = {"preset": "tiny", "stage": "occupancy"}
+    assert newest_finished(tmp_path, experiment="stage1", **asked) == run / LAST
+    assert newest_finished(tmp_path, experiment="gt_masks_stage1", **asked) is None

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -43,6 +45,25 @@ def test_threshold_counts_and_best_looks_below_it() -> None:
     assert "box_f1_sweep" not in results
 
 
+def test_numbers_of_each_class_that_is_there() -> None:
+    truth = objects([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]], [1.0, 1.0])
+    truth = replace(truth, label=torch.tensor([3, 5]))
+    # A chair found, a sofa missed, and a table where there is none.
+    found = objects([[0.0, 0.0, 0.0], [0.0, 3.0, 0.0]], [0.9, 0.9])
+    found = replace(found, label=torch.tensor([3, 6]))
+    scores = SceneScores(tasks=["objects"])
+    scores.update(batch(truth), [ScenePrediction("a", found, torch.zeros(3))])
+    numbers = scores.compute()
+    assert {name: value for name, value in numbers.items() if name.startswith("objects/accuracy/")} == {
+        "objects/accuracy/chair": 1.0,
+        "objects/accuracy/sofa": 0.0,
+    }
+    assert {name: value for name, value in numbers.items() if name.startswith("objects/f1_0.5/")} == {
+        "objects/f1_0.5/chair": 1.0,
+        "objects/f1_0.5/sofa": 0.0,
+    }
+
+
 def test_only_metrics_of_the_tasks() -> None:
     truth = objects([[0.0, 0.0, 0.0]], [1.0])
     scores = SceneScores(tasks=["objects"])
@@ -52,6 +73,9 @@ def test_only_metrics_of_the_tasks() -> None:
         "objects/accuracy_class",
         "objects/f1_0.25",
         "objects/f1_0.5",
+        "objects/accuracy/chair",
+        "objects/f1_0.25/chair",
+        "objects/f1_0.5/chair",
     }
     scores.reset()
     assert scores.results()["accuracy"]["n_total"] == 0

@@ -108,6 +108,10 @@ class SceneDataset(Dataset[SceneBatch]):
     def __len__(self) -> int:
         return len(self.scene_ids)
 
+    def num_objects(self, index: int) -> int:
+        """Return how many objects scene ``index`` has, without reading the scene."""
+        return len(self._objects_of[index])
+
     def set_epoch(self, epoch: int) -> None:
         """Choose the random frames of another epoch; call it before the loader's iterator is made."""
         self._epoch.fill_(epoch)

@@ -5,19 +5,23 @@ from __future__ import annotations
 
 import json
 import logging
-import os
+import signal
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from raytran.data.atomic import write_json
 from raytran.errors import ConfigError, RaytranError
 from raytran.run.entry import compose
 from raytran.run.folders import LAST, read_finished, write_finished
 from raytran.run.train import FitResult, train
+from raytran.training.callbacks.stop_signals import SIGNALS
 
 _log = logging.getLogger(__name__)
 
@@ -73,18 +77,44 @@ def run_curriculum(
 
 
 def _fit(settings: Sequence[str], folder: Path) -> FitResult:
-    """Train one stage: in this process on one device, else as a command of its own."""
+    """Train one stage: in this process on one device, else as a command of its own.
+
+    Raises:
+        RaytranError: the command failed.
+    """
     cfg = compose("train", settings)
     if str(cfg.trainer.devices) == "1" and cfg.trainer.num_nodes == 1:
         return train(cfg)
-    done = subprocess.run([sys.executable, "-m", "raytran.train", *settings], check=False)
+    code = _run([sys.executable, "-m", "raytran.train", *settings])
     finished = read_finished(folder)
-    if done.returncode != 0 or finished is None:
+    if code != 0 or finished is None:
         raise RaytranError(
-            f"the stage in {folder} stopped with exit code {done.returncode}: mend what it says above, "
+            f"the stage in {folder} stopped with exit code {code}: mend what it says above, "
             "then give the same command again to continue"
         )
     return FitResult(folder, folder / LAST, finished.steps, 0.0, {})
+
+
+def _run(command: Sequence[str]) -> int:
+    """Run a command and return its exit code; pass signals to stop on to it, and stop after it."""
+    stopped_by = 0
+    with subprocess.Popen(command) as process:
+
+        def pass_on(signum: int, frame: FrameType | None) -> None:
+            nonlocal stopped_by
+            stopped_by = signum
+            if signum != signal.SIGINT:  # Ctrl-C reaches all processes of a terminal
+                process.send_signal(signum)
+
+        earlier = {signum: signal.signal(signum, pass_on) for signum in SIGNALS}
+        try:
+            code = process.wait()
+        finally:
+            for signum, handler in earlier.items():
+                signal.signal(signum, handler)
+    if stopped_by and code != 0:
+        raise SystemExit(128 + stopped_by)
+    return code
 
 
 def _record(output_dir: Path, overrides: Sequence[str], stages: Sequence[str]) -> None:
@@ -92,7 +122,7 @@ def _record(output_dir: Path, overrides: Sequence[str], stages: Sequence[str]) -
     path = output_dir / RECORD
     settings = {"overrides": sorted(overrides), "stages": list(stages)}
     if path.is_file():
-        earlier = json.loads(path.read_text())
+        earlier = _read_record(path)
         if earlier != settings:
             typed = " ".join(earlier["overrides"]) or "no overrides"
             raise ConfigError(
@@ -100,10 +130,14 @@ def _record(output_dir: Path, overrides: Sequence[str], stages: Sequence[str]) -
                 "give the same to continue it, or resume=none to start a new one"
             )
         return
-    output_dir.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".part")
-    partial.write_text(json.dumps(settings, indent=2) + "\n")
-    os.replace(partial, path)
+    write_json(path, settings)
+
+
+def _read_record(path: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(path.read_text()))
+    except (ValueError, TypeError) as error:
+        raise ConfigError(f"{path} is damaged: delete it and give the same command again") from error
 
 
 def _preset(overrides: Sequence[str]) -> str:

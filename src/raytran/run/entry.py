@@ -73,6 +73,12 @@ def _compose_or_exit(command: Callable[[], Any], typed: str | None) -> Any:
     except RaytranError as error:  # of a sweep; those of a single run do not come so far
         _set_full_error(typed)
         _exit_with(error)
+    except RuntimeError as error:
+        _set_full_error(typed)
+        if not str(error).startswith("Unknown plugin class"):
+            raise
+        extras = "'raytran[sweep]' brings Optuna's sweeper, 'raytran[cluster]' the launcher for SLURM"
+        _exit_with(ConfigError(f"{_first_line(error)}: it is not installed; pip install {extras}"))
     except OmegaConfBaseException as error:
         _set_full_error(typed)
         # A resolver of ours that objects is wrapped by OmegaConf; its message is the clearer one.

@@ -8,7 +8,7 @@ import json
 import logging
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from hydra.core.hydra_config import HydraConfig
@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
-from torch.utils.data import Dataset
+from torch.utils.data import Dataset, Subset
 
 from raytran.errors import ConfigError
 from raytran.metrics.curves import accuracy_by_scene_size
@@ -68,21 +68,47 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     tasks = TASKS_WITH_SHAPE if settings.stage == "shape" else TASKS
     if "shape" in tasks:
         cfg.stage.targets = [*cfg.stage.targets, "shapes"]
+    # A model that was trained with the true masks as a fourth channel gets them here.
+    cfg.data.dataset.input_mask = model.backbone.resnet.input_channels == 4
     cfg.model.grid_resolution, cfg.model.grid_extent = list(model.grid_resolution), list(model.grid_extent)
     data = build_data(cfg)
     data.prepare_data()
     metrics = evaluate_model(
         model,
-        data.split(cfg.split),
+        with_at_most(cfg.max_objects, data.split(cfg.split)),
         tasks=tasks,
         output=output,
         score_threshold=cfg.score_threshold,
         duplicate_iou=cfg.duplicate_iou,
-        about={"checkpoint": str(cfg.checkpoint), "data": str(data.root), "split": cfg.split},
+        about={
+            "checkpoint": str(cfg.checkpoint),
+            "data": str(data.root),
+            "split": cfg.split,
+            "max_objects": cfg.max_objects,
+        },
     )
     Console().print(metrics_table(metrics, title=f"{settings.preset}, {cfg.split} scenes of {data.root}"))
     _log.info("wrote %s: metrics.json, per_scene.csv, per_object.csv", output.resolve())
     return metrics
+
+
+def with_at_most(max_objects: int | None, dataset: Any) -> Dataset[SceneBatch]:
+    """Return the scenes with at most so many objects; all of them for None.
+
+    Args:
+        max_objects: largest number of annotated objects.
+        dataset: scenes, with ``num_objects(index)``.
+
+    Raises:
+        ConfigError: no scene has so few.
+    """
+    if max_objects is None:
+        return cast("Dataset[SceneBatch]", dataset)
+    chosen = [index for index in range(len(dataset)) if dataset.num_objects(index) <= max_objects]
+    if not chosen:
+        raise ConfigError(f"no scene has at most {max_objects} objects: choose a larger max_objects")
+    _log.info("%d of %d scenes have at most %d objects", len(chosen), len(dataset), max_objects)
+    return Subset(dataset, chosen)
 
 
 def evaluate_model(

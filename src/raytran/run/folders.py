@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The folders of runs: where a new one goes, which one to continue, which finished stage to start from.
 
-A run lives in ``<outputs>/<preset>/<experiment>/<time>``. It holds ``checkpoints/last.ckpt`` while it goes on
-and, once its last step is done, ``finished.json``.
+A run lives in ``<outputs>/<preset>/<experiment>/<time>``. It holds ``checkpoints/last.ckpt`` and the one
+before it while it goes on and, once its last step is done, ``finished.json``.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -17,8 +20,12 @@ from omegaconf import OmegaConf
 
 from raytran.errors import CheckpointError, ConfigError
 
+_log = logging.getLogger(__name__)
+
 LAST = Path("checkpoints") / "last.ckpt"
+PREVIOUS = LAST.with_name("previous.ckpt")
 FINISHED = "finished.json"
+_LOCK = ".lock"
 
 
 @dataclass(frozen=True)
@@ -40,6 +47,29 @@ class Finished:
     checkpoint: str
     steps: int
     time: str
+
+
+@contextmanager
+def one_at_a_time(folder: Path) -> Iterator[None]:
+    """Keep other processes from training in ``folder`` until the block ends or this process is killed.
+
+    Raises:
+        ConfigError: one does already.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / _LOCK).open("a") as file:
+        try:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ConfigError(
+                f"another process trains in {folder}: wait for it to end, or stop it, and try again"
+            ) from error
+        except (ImportError, OSError) as error:
+            # Windows, and some network disks: there it is for the user not to start two.
+            _log.debug("cannot lock %s: %s", folder, error)
+        yield
 
 
 def write_finished(folder: Path, *, stage: str, preset: str, experiment: str, steps: int) -> Finished:
@@ -69,12 +99,21 @@ def read_finished(folder: Path) -> Finished | None:
         ) from error
 
 
-def newest_finished(outputs: Path, *, preset: str, stage: str) -> Path | None:
-    """Return the checkpoint of the newest finished run of ``stage`` with ``preset``, if there is one."""
+def newest_finished(outputs: Path, *, preset: str, stage: str, experiment: str | None = None) -> Path | None:
+    """Return the checkpoint of the newest finished run of ``stage`` with ``preset``, if there is one.
+
+    Args:
+        outputs: top folder of all runs.
+        preset: the preset.
+        stage: name of the stage.
+        experiment: the experiment; None for any. Networks of two experiments may differ (a fourth channel).
+    """
     found = []
     for path in (outputs / preset).glob(f"**/{FINISHED}"):
         mark = read_finished(path.parent)
-        if mark is not None and (mark.stage, mark.preset) == (stage, preset):
+        if mark is None or (mark.stage, mark.preset) != (stage, preset):
+            continue
+        if experiment in (None, mark.experiment):
             checkpoint = path.parent / mark.checkpoint
             if checkpoint.is_file():
                 found.append((mark.time, checkpoint))
@@ -82,15 +121,20 @@ def newest_finished(outputs: Path, *, preset: str, stage: str) -> Path | None:
 
 
 def newest_unfinished(parent: Path, holds: Path) -> Path | None:
-    """Return the newest folder in ``parent`` that has the file ``holds`` but no ``finished.json``."""
+    """Return the newest folder in ``parent`` that has the file ``holds`` but no ``finished.json``.
+
+    A checkpoint that is gone counts as long as the one before it is there.
+    """
     if not parent.is_dir():
         return None
+    names = [LAST, PREVIOUS] if holds == LAST else [holds]
     found = [
-        folder
+        (path.stat().st_mtime, folder)
         for folder in parent.iterdir()
-        if (folder / holds).is_file() and not (folder / FINISHED).exists()
+        for path in (folder / name for name in names)
+        if path.is_file() and not (folder / FINISHED).exists()
     ]
-    return max(found, key=lambda folder: (folder / holds).stat().st_mtime, default=None)
+    return max(found)[1] if found else None
 
 
 def run_folder(outputs: str, preset: str, experiment: str, resume: str, holds: str = LAST.as_posix()) -> str:

@@ -16,8 +16,6 @@ from raytran.training.stage import Stage
 
 _log = logging.getLogger(__name__)
 
-_ANYWAY = "or give check_parent=false to start from it all the same"
-
 
 @dataclass(frozen=True)
 class Parent:
@@ -37,11 +35,16 @@ class Parent:
 
     @staticmethod
     def of(path: Path, checkpoint: Mapping[str, Any]) -> Parent:
-        """Return what is to be remembered of a parent."""
-        scores = checkpoint.get("scores")
-        found = scores if isinstance(scores, dict) else {}
-        step = checkpoint.get("global_step", 0)
-        return Parent(str(path), checkpoint["stage"], int(step), {k: float(v) for k, v in found.items()})
+        """Return what is to be remembered of a parent.
+
+        Raises:
+            CheckpointError: the file says nothing sensible.
+        """
+        try:
+            scores = {name: float(value) for name, value in checkpoint.get("scores", {}).items()}
+            return Parent(str(path), checkpoint["stage"], int(checkpoint.get("global_step", 0)), scores)
+        except (AttributeError, TypeError, ValueError) as error:
+            raise CheckpointError(f"{path} says odd things of itself ({error}): it is damaged") from error
 
     def as_plain(self) -> dict[str, Any]:
         """Return plain Python, to be written into a checkpoint."""
@@ -58,7 +61,9 @@ def find_parent(run: RunConfig, stage: Stage) -> Path | None:
         return Path(run.init_from)
     if run.init_from == "none" or stage.parent is None:
         return None
-    found = newest_finished(Path(run.outputs), preset=run.preset, stage=stage.parent)
+    found = newest_finished(
+        Path(run.outputs), preset=run.preset, stage=stage.parent, experiment=stage.parent_experiment
+    )
     if found is None:
         raise ConfigError(
             f"no finished run of stage {stage.parent} with preset {run.preset} under "
@@ -69,42 +74,45 @@ def find_parent(run: RunConfig, stage: Stage) -> Path | None:
     return found
 
 
-def check_parent(parent: Parent, stage: Stage, *, refuse: bool) -> None:
+def check_parent(parent: Parent, stage: Stage, check: str) -> None:
     """Raise unless ``parent`` is of the stage that ``stage`` builds on, or of its own, and knows its task.
 
     Args:
         parent: the checkpoint to start from.
         stage: the stage to train.
-        refuse: False only warns.
+        check: ``scores``, or ``stage`` to leave out its task, or ``none`` to warn only.
 
     Raises:
         CheckpointError: the parent is of another stage or its validation score is too low.
     """
-    objection = _objection(parent, stage)
-    if objection is None:
-        return
-    if refuse:
-        raise CheckpointError(f"{parent.path} {objection}, {_ANYWAY}")
-    _log.warning("%s %s; starting from it because of check_parent=false", parent.path, objection)
-
-
-def _objection(parent: Parent, stage: Stage) -> str | None:
     if stage.parent is None or parent.stage == stage.name:
-        return None
+        return
     again = f"train experiment={stage.parent_experiment}"
     if parent.stage != stage.parent:
-        return f"is of stage {parent.stage}, but stage {stage.name} builds on {stage.parent}: {again} first"
+        objection = (
+            f"{parent.path} is of stage {parent.stage}, but stage {stage.name} builds on {stage.parent}"
+        )
+        if check == "none":
+            _log.warning("%s", objection)
+            return
+        raise CheckpointError(f"{objection}: {again} first, or force it with check_parent=none")
+    unlearned = _unlearned(parent, stage) if check == "scores" else None
+    if unlearned is not None:
+        raise CheckpointError(
+            f"{parent.path} {unlearned}: {again} longer, or force it with check_parent=stage"
+        )
+
+
+def _unlearned(parent: Parent, stage: Stage) -> str | None:
+    """Say why ``parent`` has not learned its task, None if it has."""
     if stage.parent_score is None:
         return None
     score = parent.scores.get(f"val/{stage.parent_score}")
-    task = stage.parent_score.partition("/")[0]
     if score is None:
-        return (
-            f"has never been validated, so that its {stage.parent_score} is unknown: {again} with validation"
-        )
+        return f"has never been validated, so that its {stage.parent_score} is unknown"
     if not score > stage.parent_minimum:
         return (
-            f"has not learned {task}: its validation {stage.parent_score} is {score:.3g} and must exceed "
-            f"{stage.parent_minimum:g} (stage.parent_minimum): {again} longer"
+            f"has not learned {stage.parent_score.partition('/')[0]}: its validation {stage.parent_score} "
+            f"is {score:.3g} and must exceed {stage.parent_minimum:g} (stage.parent_minimum)"
         )
     return None

@@ -11,6 +11,7 @@ from omegaconf.errors import OmegaConfBaseException
 from raytran.errors import ConfigError
 
 PROGRESS_BARS = ("rich", "tqdm", "none")
+PARENT_CHECKS = ("scores", "stage", "none")
 
 
 @dataclass
@@ -24,7 +25,8 @@ class RunConfig:
         outputs: top folder of all runs, searched by ``init_from=auto``.
         output_dir: folder of this run.
         init_from: ``auto``, ``none``, or a checkpoint whose weights to start from.
-        check_parent: refuse a parent that is of another stage or has not learned its task.
+        check_parent: ``scores`` refuses a parent of another stage or one that has not learned its task,
+            ``stage`` only the former, ``none`` nothing.
         resume: ``none``, ``auto``, or the checkpoint of an interrupted run to continue.
         checkpoint_every: optimiser steps between two writings of the last checkpoint.
         progress_bar: ``rich``, ``tqdm`` or ``none``.
@@ -36,7 +38,7 @@ class RunConfig:
     outputs: str
     output_dir: str
     init_from: str
-    check_parent: bool
+    check_parent: str
     resume: str
     checkpoint_every: int
     progress_bar: str
@@ -58,6 +60,10 @@ class RunConfig:
         if typed.progress_bar not in PROGRESS_BARS:
             raise ConfigError(
                 f"unknown progress_bar={typed.progress_bar}: choose one of {', '.join(PROGRESS_BARS)}"
+            )
+        if typed.check_parent not in PARENT_CHECKS:
+            raise ConfigError(
+                f"unknown check_parent={typed.check_parent}: choose one of {', '.join(PARENT_CHECKS)}"
             )
         if typed.checkpoint_every < 1:
             raise ConfigError(f"checkpoint_every must be at least 1, got {typed.checkpoint_every}")

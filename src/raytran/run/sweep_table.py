@@ -48,7 +48,7 @@ class JobResult:
 
 
 def report(folder: Path, results: Sequence[JobResult]) -> None:
-    """Add the results to ``results.csv`` of the sweep and show the table of all its jobs."""
+    """Add the results to ``results.csv`` of the sweep; if they are several, show the table of all jobs."""
     rows = merged_rows(folder, results)
     settings = sorted({name for row in rows for name in row if name not in _OF_EVERY_JOB})
     text = io.StringIO()
@@ -56,7 +56,8 @@ def report(folder: Path, results: Sequence[JobResult]) -> None:
     writer.writeheader()
     writer.writerows(rows)
     write_text(folder / RESULTS, text.getvalue())
-    Console(soft_wrap=True).print(results_table(rows, title=f"sweep {folder}"))
+    if len(results) > 1:  # a sampler that draws one job after another shows its own best
+        Console(soft_wrap=True).print(results_table(rows, title=f"sweep {folder}"))
 
 
 def merged_rows(folder: Path, results: Sequence[JobResult]) -> list[dict[str, str]]:

@@ -3,11 +3,10 @@
 
 from __future__ import annotations
 
-import json
 import logging
-import os
 import time
 import warnings
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,13 +16,16 @@ from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from omegaconf import DictConfig, OmegaConf
 
+from raytran.data.atomic import write_json, write_text
 from raytran.errors import CheckpointError, ConfigError
 from raytran.run.build import build_data, build_model, build_module, build_trainer, plain
 from raytran.run.checkpoint import checkpoint_card, load_weights
-from raytran.run.folders import LAST, read_finished, write_finished
+from raytran.run.folders import LAST, one_at_a_time, read_finished, write_finished
+from raytran.run.memory import explained_out_of_memory
 from raytran.run.parent import Parent, check_parent, find_parent
 from raytran.run.provenance import provenance
 from raytran.run.settings import RunConfig
+from raytran.run.start_report import start_report
 from raytran.training.callbacks.stop_signals import StopRequestedError
 from raytran.training.checkpoint_file import read_checkpoint, read_newest
 from raytran.training.reconstruction import Reconstruction
@@ -64,9 +66,12 @@ def train(cfg: DictConfig) -> FitResult:
     """
     run = RunConfig.read(cfg)
     folder = Path(run.output_dir)
-    finished = _finished_before(run, folder)
-    if finished is not None:
-        return finished
+    with one_at_a_time(folder) if _is_first_rank() else nullcontext():
+        return _finished_before(run, folder) or _train(cfg, run, folder)
+
+
+def _train(cfg: DictConfig, run: RunConfig, folder: Path) -> FitResult:
+    """Train what is left to train."""
     pl.seed_everything(run.seed, workers=True, verbose=False)
     _quiet()
     module, resume_from, parent = _start(cfg, run)
@@ -76,9 +81,12 @@ def train(cfg: DictConfig) -> FitResult:
     if trainer.is_global_zero:
         _describe_run(cfg, folder)
     _log.info("stage %s, %d steps, in %s", module.stage.name, trainer.max_steps, folder)
+    for line in start_report(module.stage, module.model, parent):
+        _log.info("%s", line)
     began = time.monotonic()
     try:
-        trainer.fit(module, data, ckpt_path=resume_from)
+        with explained_out_of_memory(cfg):
+            trainer.fit(module, data, ckpt_path=resume_from)
     except StopRequestedError as stop:
         # One rank tells the shell; Lightning and torchrun would take codes of the others for a crash.
         raise SystemExit(128 + stop.signum if trainer.is_global_zero else 0) from stop
@@ -134,7 +142,7 @@ def _start(cfg: DictConfig, run: RunConfig) -> tuple[Reconstruction, Path | None
         return build_module(cfg, build_model(cfg)), None, None
     content = read_checkpoint(start)
     parent = Parent.of(start, content)
-    check_parent(parent, stage, refuse=run.check_parent)
+    check_parent(parent, stage, run.check_parent)
     module = build_module(cfg, build_model(cfg, pretrained=False))
     load_weights(module.model, content, start)
     return module, None, parent.as_plain()
@@ -158,20 +166,17 @@ def _stage(cfg: DictConfig) -> Stage:
 
 def _describe_run(cfg: DictConfig, folder: Path) -> None:
     """Write the resolved config and where the code comes from beside the results."""
-    folder.mkdir(parents=True, exist_ok=True)
-    texts: dict[str, str] = {
-        "config.yaml": OmegaConf.to_yaml(cfg, resolve=True),
-        "provenance.json": json.dumps(provenance(), indent=2) + "\n",
-    }
-    for name, text in texts.items():
-        partial = folder / f"{name}.part"
-        partial.write_text(text)
-        os.replace(partial, folder / name)
+    write_text(folder / "config.yaml", OmegaConf.to_yaml(cfg, resolve=True))
+    write_json(folder / "provenance.json", provenance())
+
+
+def _is_first_rank() -> bool:
+    return getattr(rank_zero_only, "rank", 0) == 0
 
 
 def _quiet() -> None:
     """Silence Lightning's advice where we decided on purpose, and all ranks but the first."""
-    if getattr(rank_zero_only, "rank", 0) != 0:
+    if not _is_first_rank():
         logging.getLogger("raytran").setLevel(logging.WARNING)
     for name in ("lightning.pytorch", "lightning.fabric"):
         logger = logging.getLogger(name)

@@ -45,7 +45,7 @@ def set_random_states(states: dict[str, Any], device: torch.device) -> None:
         torch.set_rng_state(states["torch"])
         if device.type == "cuda" and isinstance(states["cuda"], Tensor):
             torch.cuda.set_rng_state(states["cuda"], device)
-    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+    except (LookupError, TypeError, ValueError, RuntimeError, AttributeError) as error:
         raise CheckpointError(
             "the random states in the checkpoint are damaged: start a new run with init_from="
         ) from error

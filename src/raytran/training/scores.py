@@ -113,14 +113,23 @@ class SceneScores(nn.Module):
         return found
 
     def compute(self) -> dict[str, float]:
-        """Return the numbers to watch during training, by ``task/number``."""
+        """Return the numbers to watch during training: ``task/number``, ``task/number/class``.
+
+        Classes are those of the true objects.
+        """
         found = self.results()
         numbers: dict[str, float] = {}
         if "accuracy" in found:
             numbers["objects/accuracy_global"] = found["accuracy"]["global_average"]
             numbers["objects/accuracy_class"] = found["accuracy"]["class_average"]
+            for name, entry in found["accuracy"]["per_class"].items():
+                if entry["n_total"]:
+                    numbers[f"objects/accuracy/{name}"] = entry["accuracy"]
         for threshold, values in found.get("box_f1", {}).get("per_threshold", {}).items():
             numbers[f"objects/f1_{threshold}"] = values["f1"]
+            for name, entry in values["per_class"].items():
+                if entry["n_true"]:
+                    numbers[f"objects/f1_{threshold}/{name}"] = entry["f1"]
         for task in ("occupancy", "foreground"):
             if task in found:
                 numbers[f"{task}/iou"] = found[task]

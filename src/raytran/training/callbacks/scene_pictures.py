@@ -1,0 +1,134 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of the same scenes at every validation, in the run's folder and in the loggers that take any."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from pathlib import Path
+from typing import Any
+
+import lightning.pytorch as pl
+import numpy as np
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
+from PIL import Image
+
+from raytran.data.atomic import finished_folder, no_room
+from raytran.data.collate import collate_scenes
+from raytran.data.views import choose_even
+from raytran.postprocess import select_objects
+from raytran.training.datamodule import SceneDataModule
+from raytran.training.reconstruction import Reconstruction
+from raytran.training.scores import DUPLICATE_IOU, SCORE_THRESHOLD
+from raytran.types import SceneBatch, ScenePrediction
+from raytran.view.scene_pictures import draw_scene
+
+_log = logging.getLogger(__name__)
+
+
+class ScenePictures(pl.Callback):
+    """Draws a few validation scenes, spread evenly over the split, after every validation.
+
+    The first rank alone predicts and draws them; the others wait for it at the next step. Files go to
+    ``<folder>/step-000300/<scene>``. TensorBoard gets the images; W&B those, the boxes in 3D, and a table of
+    predicted and true objects.
+
+    Args:
+        folder: for the pictures.
+        scenes: how many scenes.
+    """
+
+    def __init__(self, folder: Path, *, scenes: int) -> None:
+        self._folder = folder
+        self._scenes = scenes
+
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Draw and log."""
+        data: Any = getattr(trainer, "datamodule", None)
+        if not isinstance(pl_module, Reconstruction) or not isinstance(data, SceneDataModule):
+            return
+        if not trainer.is_global_zero:
+            return
+        step, found = trainer.global_step, self._predict(pl_module, data)
+        grid_extent = pl_module.model.grid_extent
+        try:
+            pictures = self._draw(found, step, grid_extent)
+        except OSError as error:
+            if no_room(error) is None:
+                raise
+            _log.warning("no pictures of step %d (%s): make room in %s", step, error.strerror, self._folder)
+            return
+        logged_at = step - 1  # where Lightning, which counts logged steps from 0, puts the scores
+        for logger in trainer.loggers:
+            if isinstance(logger, TensorBoardLogger):
+                _log_tensorboard(logger, pictures, logged_at)
+            elif isinstance(logger, WandbLogger):
+                _log_wandb(logger, pictures, found, logged_at, grid_extent)
+
+    @torch.no_grad()
+    def _predict(
+        self, module: Reconstruction, data: SceneDataModule
+    ) -> list[tuple[SceneBatch, ScenePrediction]]:
+        """Return the scenes, always the same ones, and what the network makes of them now."""
+        dataset: Any = data.split("val")
+        chosen = dict.fromkeys(choose_even(len(dataset), min(self._scenes, len(dataset))).tolist())
+        stage, found = module.stage, []
+        for index in chosen:
+            batch = collate_scenes([dataset[index]])
+            views, center = batch.views.to(module.device), batch.grid_center.to(module.device)
+            with module.trainer.precision_plugin.val_step_context():
+                raw = module.model(views, tasks=stage.tasks, grid_center=center)
+            (prediction,) = module.model.decode(raw, batch.scene_id, with_shapes="shape" in stage.terms)
+            prediction = select_objects(
+                prediction, score_threshold=SCORE_THRESHOLD, duplicate_iou=DUPLICATE_IOU
+            )
+            found.append((batch, prediction.to("cpu")))
+        return found
+
+    def _draw(
+        self,
+        found: list[tuple[SceneBatch, ScenePrediction]],
+        step: int,
+        grid_extent: tuple[float, float, float],
+    ) -> dict[str, Path]:
+        """Return name of each picture, ``<scene>/masks`` and so on → its file."""
+        final = self._folder / f"step-{step:06d}"
+        self._folder.mkdir(parents=True, exist_ok=True)
+        if final.is_dir():
+            shutil.rmtree(final)  # of a validation that a resumed run does again
+        pictures: dict[str, Path] = {}
+        with finished_folder(final) as folder:
+            for batch, prediction in found:
+                name = prediction.scene_id
+                drawn = draw_scene(folder / name, batch, prediction, grid_extent=grid_extent)
+                pictures |= {f"{name}/{kind}": final / name / path.name for kind, path in drawn.items()}
+        return pictures
+
+
+def _log_tensorboard(logger: TensorBoardLogger, pictures: dict[str, Path], step: int) -> None:
+    for name, path in pictures.items():
+        image = np.asarray(Image.open(path).convert("RGB"))
+        logger.experiment.add_image(f"pictures/{name}", image, step, dataformats="HWC")
+    logger.experiment.flush()
+
+
+def _log_wandb(
+    logger: WandbLogger,
+    pictures: dict[str, Path],
+    found: list[tuple[SceneBatch, ScenePrediction]],
+    step: int,
+    grid_extent: tuple[float, float, float],
+) -> None:
+    # Here, so that runs without W&B do not wait for its import.
+    import wandb
+
+    from raytran.training.wandb_scene import object_table, scene_in_3d
+
+    values: dict[str, Any] = {f"pictures/{name}": wandb.Image(str(path)) for name, path in pictures.items()}
+    with_objects = [pair for pair in found if pair[0].objects is not None]
+    for batch, prediction in with_objects:
+        values[f"pictures/{prediction.scene_id}/scene"] = scene_in_3d(batch, prediction, grid_extent)
+    if with_objects:
+        values["pictures/objects"] = object_table(with_objects)
+    logger.log_metrics(values, step=step)

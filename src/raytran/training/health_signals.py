@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Numbers that tell early whether a DETR-like network learns: gradients by part, how slots are used."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
+
+from raytran.losses.matcher import HungarianMatcher, Match
+from raytran.training.ranks import mean_over_ranks
+from raytran.types import PADDING, ObjectSet, RawObjects, RawScene
+
+
+@dataclass(frozen=True)
+class StepOutcome:
+    """What the last forward pass gave.
+
+    Attributes:
+        losses: terms and ``total``, means over the ranks, without a graph.
+        objects: the last decoder layer's, float32 without a graph; None if the stage has no objects.
+    """
+
+    losses: dict[str, Tensor]
+    objects: RawObjects | None
+
+    @staticmethod
+    def of(losses: dict[str, Tensor], raw: RawScene) -> StepOutcome:
+        """Return what callbacks need of a forward pass."""
+        if raw.objects is None:
+            return StepOutcome(losses, None)
+        last = raw.objects[-1]
+        exact = {field.name: getattr(last, field.name).detach().float() for field in fields(last)}
+        return StepOutcome(losses, RawObjects(**exact))
+
+
+def gradient_norms(model: nn.Module) -> dict[str, Tensor]:
+    """Return the L2 norm of the gradients of each part: ``backbone``, ``objects`` and so on, scalars."""
+    gradients: dict[str, list[Tensor]] = {}
+    for name, parameter in model.named_parameters():
+        if parameter.grad is not None:
+            part = name.removeprefix("heads.").split(".")[0]
+            gradients.setdefault(part, []).append(parameter.grad)
+    return {part: nn.utils.get_total_norm(found) for part, found in gradients.items()}
+
+
+@torch.no_grad()
+def slot_signals(
+    objects: RawObjects, targets: Sequence[ObjectSet], matcher: HungarianMatcher
+) -> dict[str, Tensor]:
+    """Return how the slots of all ranks are used, scalars in [0, 1]; all ranks must call this together.
+
+    Returns:
+        ``class_accuracy``: share of the slots matched with an object whose surest class is that object's;
+        missing where no scene has objects. It should soon leave that of guessing.
+        ``class_entropy``: entropy of a slot's classes, mean over slots, 1 if all are alike. Near 0 from the
+        start, slots are sure before they know.
+        ``slots_used``: share of the slots that say they hold an object. It should come to the mean number of
+        objects over that of slots; 0 for long, the padding class has won.
+    """
+    right, matched = _count_right(objects, targets, matcher(objects, targets))
+    log_probability = objects.class_logits.log_softmax(dim=-1)
+    entropy = -(log_probability.exp() * log_probability).sum(dim=-1) / math.log(PADDING + 1)
+    used = (log_probability.argmax(dim=-1) != PADDING).float()
+    sums = torch.stack([right, matched, entropy.mean(), used.mean()])
+    right, matched, entropy, used = mean_over_ranks(sums).unbind()
+    found = {"class_entropy": entropy, "slots_used": used}
+    return found | ({"class_accuracy": right / matched} if matched > 0 else {})
+
+
+def _count_right(
+    objects: RawObjects, targets: Sequence[ObjectSet], matches: Sequence[Match]
+) -> tuple[Tensor, Tensor]:
+    """Return the number of matched slots whose surest class is right, and of all of them."""
+    label = objects.class_logits.argmax(dim=-1)
+    hits = [
+        label[scene, match.slot] == truth.label[match.target]
+        for scene, (truth, match) in enumerate(zip(targets, matches, strict=True))
+    ]
+    every = torch.cat(hits).float()
+    return every.sum(), every.new_tensor(len(every))
+
+
+class RunningStatistics:
+    """The running means and variances of a network's batch norms, to be put back.
+
+    They take in what is not finite during the forward pass, before anybody can skip the step, and would keep
+    it for good.
+
+    Args:
+        model: the network; batch norms in evaluation mode are left out.
+    """
+
+    def __init__(self, model: nn.Module) -> None:
+        norms = [m for m in model.modules() if isinstance(m, _BatchNorm) and m.training]
+        found = [(m.running_mean, m.running_var, m.num_batches_tracked) for m in norms]
+        self._buffers = [buffer for buffers in found for buffer in buffers if buffer is not None]
+        self._kept = [buffer.clone() for buffer in self._buffers]
+
+    def keep(self) -> None:
+        """Remember how they are."""
+        for kept, buffer in zip(self._kept, self._buffers, strict=True):
+            kept.copy_(buffer)
+
+    def restore(self) -> None:
+        """Make them what they were when they were kept."""
+        for kept, buffer in zip(self._kept, self._buffers, strict=True):
+            buffer.copy_(kept)

@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A run on two ranks that loses itself: it gives up, says so, and its last step can be done again."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from raytran.errors import CheckpointError
+from raytran.run.entry import compose
+from raytran.run.folders import LAST
+from raytran.run.replay import replay
+from raytran.training.checkpoint_file import read_checkpoint
+
+
+@pytest.fixture(scope="module")
+def lost(settings, tmp_path_factory, command):
+    """The folder of the run and what the command said; its first step makes weights as large as 1e29."""
+    folder = tmp_path_factory.mktemp("lost")
+    arguments = [
+        *(item for item in settings if item != "trainer=cpu"),
+        "trainer=ddp_cpu",
+        "views.batch_size=1",
+        "optimizer.learning_rate=1e30",
+        "watch.max_skipped=3",
+        "trainer.max_steps=20",
+        f"output_dir={folder / 'run'}",
+    ]
+    return folder / "run", command("train", *arguments, folder=folder)
+
+
+def test_it_gives_up_in_one_sentence(lost):
+    folder, done = lost
+    assert done.returncode == 1
+    said = [line for line in done.stderr.splitlines() if line.startswith("raytran: ")]
+    assert len(said) == 1, done.stderr
+    assert "3 steps in a row were not finite, the last one step 3 (the loss (occupancy))" in said[0]
+    assert f"python -m raytran.replay {folder / 'replay.pt'}" in said[0]
+    assert (folder / "replay-1.pt").is_file()
+
+
+def test_what_was_saved_is_finite(lost):
+    folder, _ = lost
+    for path in (folder / LAST, folder / "replay.pt", folder / "replay-1.pt"):
+        assert all(value.isfinite().all() for value in read_checkpoint(path)["state_dict"].values()), path
+
+
+def test_the_step_can_be_done_again(lost, capsys):
+    folder, _ = lost
+    found = replay(compose("replay", [f"file={folder / 'replay.pt'}", "device=cpu"]))
+    assert found.parts[0].startswith("backbone.")
+    assert not torch.tensor(found.losses["total"]).isfinite()
+    said = capsys.readouterr().out
+    assert "step 3 of stage occupancy" in said
+    assert f"not finite in the forward pass, in order: {found.parts[0]}" in said
+
+
+def test_a_checkpoint_is_no_replay(lost):
+    folder, _ = lost
+    with pytest.raises(CheckpointError, match="is a checkpoint without batches"):
+        replay(compose("replay", [f"file={folder / LAST}"]))

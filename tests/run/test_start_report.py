@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from raytran.run.build import build_model, build_module
+from raytran.run.entry import compose
+from raytran.run.start_report import start_report
+
+
+@pytest.mark.parametrize(
+    ("experiment", "trained", "frozen", "terms"),
+    [
+        ("stage1", ["backbone", "heads.occupancy"], ["heads.objects", "heads.shape"], "occupancy"),
+        ("stage3", ["heads.shape"], ["backbone", "heads.occupancy", "heads.objects"], "shape"),
+    ],
+)
+def test_parts_and_counts(experiment, trained, frozen, terms):
+    cfg = compose("train", ["preset=tiny", f"experiment={experiment}", "output_dir=unused"])
+    module = build_module(cfg, build_model(cfg))
+    first, second, third = start_report(module.stage, module.model, None)
+    assert first.startswith("trains ")
+    assert all(f" {name} " in first for name in trained)
+    assert second.startswith("frozen ")
+    assert all(f" {name} " in second for name in frozen)
+    assert third.startswith(f"loss terms {terms};")
+    counts = [int(line.split()[1].replace(",", "")) for line in (first, second)]
+    assert sum(counts) == sum(parameter.numel() for parameter in module.model.parameters())
+    assert counts[0] == sum(p.numel() for p in module.model.parameters() if p.requires_grad)
+    parts = [int(number.replace(",", "")) for number in re.findall(r" ([\d,]+)(?:,|$)", first.split(":")[1])]
+    assert sum(parts) == counts[0]
+
+
+def test_the_parent_is_named_with_its_score():
+    cfg = compose("train", ["preset=tiny", "experiment=stage2", "output_dir=unused"])
+    module = build_module(cfg, build_model(cfg))
+    scores = {"val/occupancy/iou": 0.41234, "val/total": 3.0}
+    parent = {"path": "a/last.ckpt", "stage": "occupancy", "step": 1500, "scores": scores}
+    last = start_report(module.stage, module.model, parent)[-1]
+    assert last == "starts from stage occupancy, step 1500, val/occupancy/iou 0.412: a/last.ckpt"
