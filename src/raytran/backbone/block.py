@@ -91,14 +91,20 @@ class Stream(nn.Module):
         Returns:
             ``(n, ..., C)``.
         """
-        query, key, value = self.query(target), self.key(source), self.value(source)
-        attended = ray_attention(
-            self._heads(query), self._heads(key), self._heads(value), pairs, direction=self.direction
-        )
+        query, (key, value) = self.heads(self.query(target)), self.keys_and_values(source)
+        return self.finish(stream, ray_attention(query, key, value, pairs, direction=self.direction))
+
+    def keys_and_values(self, source: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what sources ``(m, ..., C)`` are scored by and what they contribute, ``(S, H, D)`` each."""
+        return self.heads(self.key(source)), self.heads(self.value(source))
+
+    def finish(self, stream: Tensor, attended: Tensor) -> Tensor:
+        """Add what was attended to, ``(T, H, D)``, to the stream ``(n, ..., C)``, then the feed-forward."""
         stream = stream + self.output(attended.flatten(1)).view(stream.shape)
         return stream + self.feed_forward(self.norm(stream))
 
-    def _heads(self, x: Tensor) -> Tensor:
+    def heads(self, x: Tensor) -> Tensor:
+        """Map ``(n, ..., C)`` to ``(T, H, D)``."""
         return x.reshape(-1, self.num_heads, x.shape[-1] // self.num_heads)
 
 
