@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from raytran.errors import ShapeError
-from raytran.ops import reference
+from raytran.ops import pair_attention, reference
+from raytran.ops import ray_attention as ray_attention_module
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_attention import ray_attention
 
@@ -144,6 +145,45 @@ def test_keeps_nothing_of_the_size_of_the_pairs_but_the_softmax_weights(random_p
     known |= {tensor.data_ptr() for tensor in inputs}
     extra = [tensor for tensor in kept if tensor.data_ptr() not in known]
     assert [tensor.numel() for tensor in extra] == [4 * len(pairs)]
+
+
+def test_operator_is_registered_as_torch_wants_it(random_pairs, generator):
+    pairs = random_pairs(5, 7, 0.5)
+    inputs = _inputs(pairs, "pixels_to_voxels", 2, 4, generator)
+    orders = [list(pairs.by(side)) for side in ("voxels", "pixels")]
+    torch.library.opcheck(pair_attention._attend, (*inputs, *orders))
+
+
+@both_directions
+def test_compile_and_export_pass_through(random_pairs, generator, direction):
+    pairs = random_pairs(9, 14, 0.4)
+    inputs = _inputs(pairs, direction, 2, 8, generator)
+
+    class Module(torch.nn.Module):
+        def forward(self, query: Tensor, key: Tensor, value: Tensor, pixel: Tensor, voxel: Tensor) -> Tensor:
+            return ray_attention(query, key, value, PairList(pixel, voxel, 9, 14), direction).relu()
+
+    index = pairs.pixel_index, pairs.voxel_index
+    expected = Module()(*inputs, *index)
+    gradients = torch.autograd.grad(expected.sum(), inputs)
+    compiled = torch.compile(Module(), fullgraph=True, backend="aot_eager")(*inputs, *index)
+    assert torch.equal(compiled, expected)
+    for mine, theirs in zip(torch.autograd.grad(compiled.sum(), inputs), gradients, strict=True):
+        assert torch.equal(mine, theirs)
+    exported = torch.export.export(Module(), (*(tensor.detach() for tensor in inputs), *index))
+    assert "raytran.pair_attention" in str(exported.graph)
+    assert torch.equal(exported.module()(*inputs, *index), expected)
+
+
+def test_blocks_on_a_cpu_run_by_torch_sparse(random_pairs, generator, monkeypatch, caplog):
+    monkeypatch.setattr(ray_attention_module, "_INTERPRETED", False)
+    ray_attention_module._log_once.cache_clear()
+    pairs = random_pairs(9, 14, 0.4)
+    inputs = _inputs(pairs, "pixels_to_voxels", 2, 8, generator)
+    with caplog.at_level("DEBUG", logger="raytran"):
+        for _ in range(2):
+            assert torch.equal(ray_attention(*inputs, pairs.blocks()), ray_attention(*inputs, pairs))
+    assert [record.message.split(": ")[1] for record in caplog.records] == ["tensors are on the CPU"]
 
 
 def test_wrong_input(random_pairs, generator):

@@ -85,7 +85,15 @@ def trace_pairs(
     voxel_index = key - pixel_index * grid.num_voxels
     if scenes > 1:
         voxel_index += pixel_index.div(num_pixels // scenes, rounding_mode="floor") * grid.num_voxels
-    return PairList(pixel_index, voxel_index, num_pixels, scenes * grid.num_voxels)
+    views = num_pixels // (feature_size[0] * feature_size[1])
+    return PairList(
+        pixel_index,
+        voxel_index,
+        num_pixels,
+        scenes * grid.num_voxels,
+        pixel_shape=(views, *feature_size),
+        voxel_shape=(scenes, *grid.resolution),
+    )
 
 
 def _rays_in_grid(

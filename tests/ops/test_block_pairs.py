@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import pytest
+import torch
+
+from raytran.errors import ShapeError
+from raytran.geometry.grid import VoxelGrid
+from raytran.ops.block_pairs import BlockPairs, Tiling
+from raytran.ops.pairs import PairList
+from raytran.ops.traverse import trace_pairs
+
+SHAPES = [
+    ((3, 8, 16), (1, 8, 4, 4)),
+    ((2, 3, 5), (2, 5, 3, 6)),
+    ((5, 9, 7), (1, 1, 1, 1)),
+    ((1, 1, 1), (2, 9, 4, 5)),
+]
+
+
+@pytest.mark.parametrize("tiling", [Tiling((2, 1, 5, 11), (1, 4, 8)), Tiling((2, 5, 4, 7), (4, 4, 4))])
+def test_every_element_lies_where_its_tile_says(tiling):
+    n, a, b, c = torch.meshgrid(*map(torch.arange, tiling.shape), indexing="ij")
+    steps, sizes = tiling.tile, tiling.tiles
+    tile = ((n * sizes[1] + a // steps[0]) * sizes[2] + b // steps[1]) * sizes[3] + c // steps[2]
+    slot = ((a % steps[0]) * steps[1] + b % steps[1]) * steps[2] + c % steps[2]
+    element = torch.arange(tiling.num_elements)
+    found_tile, found_slot = tiling.locate(element)
+    assert torch.equal(found_tile, tile.flatten())
+    assert torch.equal(found_slot, slot.flatten())
+    assert torch.equal(tiling.start(found_tile) + tiling.offset(found_slot), element)
+
+
+@pytest.mark.parametrize(("pixel_shape", "voxel_shape"), SHAPES)
+def test_blocks_hold_the_pairs_and_no_others(shaped_pairs, pixel_shape, voxel_shape):
+    pairs = shaped_pairs(pixel_shape, voxel_shape, 0.2)
+    back = PairList.from_blocks(pairs.blocks())
+    assert torch.equal(back.pixel_index, pairs.pixel_index)
+    assert torch.equal(back.voxel_index, pairs.voxel_index)
+    assert pairs.blocks() is pairs.blocks()
+
+
+def test_pairs_of_unknown_layout(random_pairs):
+    pairs = random_pairs(70, 150, 0.1)
+    assert pairs.blocks().pixels.tiles == (1, 1, 1, 3)
+    assert pairs.blocks().voxels.tiles == (1, 1, 1, 3)
+    assert torch.equal(PairList.from_blocks(pairs.blocks()).voxel_index, pairs.voxel_index)
+
+
+def test_mask_by_hand():
+    # Pixel (row 3, column 7) is the last of the first tile, voxel (4, 0, 1) the second of the second block.
+    pairs = PairList(torch.tensor([55]), torch.tensor([65]), 96, 128, (1, 6, 16), (1, 8, 4, 4))
+    blocks = pairs.blocks()
+    assert blocks.key.tolist() == [1]
+    assert blocks.masks[0].tolist() == [0, -(2**31)] + [0] * 62
+
+
+@pytest.mark.parametrize("unused", [0, 40])
+@pytest.mark.parametrize("side", ["pixels", "voxels"])
+def test_items_cover_every_row_once_and_long_rows_in_pieces(shaped_pairs, side, unused):
+    pairs = shaped_pairs((50, 4, 9), (1, 8, 5, 3), 0.05)
+    blocks = pairs.blocks()
+    end = blocks.pixels.num_tiles * blocks.voxels.num_tiles
+    blocks = BlockPairs(
+        torch.cat([blocks.key, torch.full((unused,), end)]),
+        torch.cat([blocks.masks, torch.zeros(unused, 64, dtype=torch.int32)]),
+        blocks.pixels,
+        blocks.voxels,
+    )
+    rows, others = (blocks.pixels, blocks.voxels)[:: 1 if side == "pixels" else -1]
+    order = blocks.by(side)
+    slots: dict[int, list[int]] = {}
+    visited: dict[int, list[tuple[int, int]]] = {}
+    lengths = []
+    for start, first, last, slot in order.items.tolist():
+        if start < 0:
+            continue
+        lengths.append(last - first)
+        pairs_of_item = zip(
+            order.source_start[first:last].tolist(), order.place[first:last].tolist(), strict=True
+        )
+        visited.setdefault(start, []).extend(pairs_of_item)
+        if slot >= 0:
+            slots.setdefault(start, []).append(slot)
+    assert lengths == sorted(lengths, reverse=True)
+    assert max(lengths) <= 32
+    tile, block = blocks.key // blocks.voxels.num_tiles, blocks.key % blocks.voxels.num_tiles
+    row, other = (tile, block)[:: 1 if side == "pixels" else -1]
+    assert sorted(visited) == sorted(rows.start(torch.arange(rows.num_tiles)).tolist())
+    for number in range(rows.num_tiles):
+        mine = ((row == number) & (blocks.key < end)).nonzero()[:, 0]
+        expected = list(zip(others.start(other[mine]).tolist(), mine.tolist(), strict=True))
+        assert sorted(visited[int(rows.start(torch.tensor(number)))]) == sorted(expected)
+    merges = {start: list(range(first, last)) for start, first, last in order.merges.tolist() if start >= 0}
+    assert {start: sorted(found) for start, found in slots.items()} == merges
+    assert sum(map(len, merges.values())) <= order.num_slots
+    assert (len(merges) > 0) == (side == "voxels")  # a tile touches at most the 8 blocks
+
+
+def test_no_pair_at_all():
+    none = torch.zeros(0, dtype=torch.int64)
+    blocks = PairList(none, none, 40, 70).blocks()
+    assert blocks.masks.shape == (0, 64)
+    assert blocks.by("pixels").items.tolist() == [[0, 0, 0, -1], [32, 0, 0, -1]]
+    assert blocks.by("voxels").merges.shape == (0, 3)
+
+
+def test_share_of_the_matrix_on_traced_pairs(random_cameras):
+    cameras = random_cameras(6, spread=0.3)
+    pairs = trace_pairs(cameras, VoxelGrid((24, 24, 8), (9.0, 9.0, 3.5), torch.zeros(3)), (30, 40), 2)
+    assert pairs.pixel_shape == (6, 30, 40)
+    assert pairs.voxel_shape == (1, 24, 24, 8)
+    blocks = pairs.blocks()
+    # Neighbours share their blocks; runs of a row or column touch more than half as many again.
+    scattered = PairList(pairs.pixel_index, pairs.voxel_index, pairs.num_pixels, pairs.num_voxels).blocks()
+    assert 3 * len(blocks) < 2 * len(scattered)
+
+
+def test_shape_of_other_size_is_an_error():
+    none = torch.zeros(0, dtype=torch.int64)
+    with pytest.raises(ShapeError, match="expected a shape of 4 elements"):
+        PairList(none, none, 4, 5, pixel_shape=(1, 2, 3))
