@@ -102,15 +102,14 @@ def attend_backward_sources(
     value = load_box(inputs[2], start, places, there, heads * DIM, OPERAND)
     others = box_offsets(sizes[1], TILES[1])
     other_places = channel_places(others, head, heads, DIM, WIDTH)
-    d_key = tl.zeros((ROWS, WIDTH), tl.float32)
-    d_value = tl.zeros((ROWS, WIDTH), tl.float32)
+    d_key, d_value = tl.zeros((ROWS, WIDTH), tl.float32), tl.zeros((ROWS, WIDTH), tl.float32)
     for pair in range(tl.load(item_ptr + 1), tl.load(item_ptr + 2)):
         target = tl.load(order[0] + pair)
         exists = target + others < sizes[3]
         query = load_box(inputs[0], target, other_places, exists[:, None] & is_channel, heads * DIM, OPERAND)
         grad = load_box(inputs[4], target, other_places, exists[:, None] & is_channel, heads * DIM, OPERAND)
         at = (target + others) * heads + head
-        logsumexp = tl.load(saved[0] + at, mask=exists, other=float("inf"))
+        logsumexp = tl.load(saved[0] + at, mask=exists, other=0.0)
         delta = tl.load(saved[1] + at, mask=exists, other=0.0)
         score = tl.dot(key, tl.trans(query), input_precision="ieee") * (scale * LOG2_E)
         score = tl.where(box_mask(order[3], tl.load(order[1] + pair), ROWS == 64), score, -float("inf"))
