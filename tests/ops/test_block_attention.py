@@ -134,8 +134,8 @@ def test_operator_is_registered_as_torch_wants_it(shaped_pairs, generator):
     pairs = shaped_pairs((1, 3, 5), (1, 2, 2, 2), 0.5)
     inputs = _inputs(pairs, "pixels_to_voxels", 1, 16, generator)
     blocks = pairs.blocks().to(DEVICE)
-    orders = [block_attention._tensors(blocks.by(side)) for side in ("voxels", "pixels")]
-    layouts = [block_attention._layout(tiling) for tiling in (blocks.voxels, blocks.pixels)]
+    orders = [block_attention.tensors_of(blocks.by(side)) for side in ("voxels", "pixels")]
+    layouts = [block_attention.layout_of(tiling) for tiling in (blocks.voxels, blocks.pixels)]
     torch.library.opcheck(block_attention._attend, (*inputs, blocks.masks, *orders, [0, 0], *layouts))
 
 

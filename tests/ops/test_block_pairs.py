@@ -8,6 +8,7 @@ from raytran.errors import ShapeError
 from raytran.geometry.grid import VoxelGrid
 from raytran.ops.block_pairs import BlockPairs, Tiling
 from raytran.ops.pairs import PairList
+from raytran.ops.reference import pair_mask
 from raytran.ops.traverse import trace_pairs
 
 SHAPES = [
@@ -120,3 +121,9 @@ def test_shape_of_other_size_is_an_error():
     none = torch.zeros(0, dtype=torch.int64)
     with pytest.raises(ShapeError, match="expected a shape of 4 elements"):
         PairList(none, none, 4, 5, pixel_shape=(1, 2, 3))
+
+
+@pytest.mark.parametrize(("pixel_shape", "voxel_shape"), SHAPES)
+def test_number_of_pixels_of_each_voxel(shaped_pairs, pixel_shape, voxel_shape):
+    pairs = shaped_pairs(pixel_shape, voxel_shape, 0.5)
+    assert torch.equal(pairs.blocks().pixels_per_voxel(), pair_mask(pairs).sum(dim=0))

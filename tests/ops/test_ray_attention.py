@@ -6,8 +6,7 @@ import torch
 from torch import Tensor
 
 from raytran.errors import ShapeError
-from raytran.ops import pair_attention, reference
-from raytran.ops import ray_attention as ray_attention_module
+from raytran.ops import fused, pair_attention, reference
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_attention import ray_attention
 
@@ -176,8 +175,8 @@ def test_compile_and_export_pass_through(random_pairs, generator, direction):
 
 
 def test_blocks_on_a_cpu_run_by_torch_sparse(random_pairs, generator, monkeypatch, caplog):
-    monkeypatch.setattr(ray_attention_module, "_INTERPRETED", False)
-    ray_attention_module._log_once.cache_clear()
+    monkeypatch.setattr(fused, "_INTERPRETED", False)
+    fused._log_once.cache_clear()
     pairs = random_pairs(9, 14, 0.4)
     inputs = _inputs(pairs, "pixels_to_voxels", 2, 8, generator)
     with caplog.at_level("DEBUG", logger="raytran"):

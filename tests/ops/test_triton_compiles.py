@@ -34,8 +34,12 @@ def compile_only(self, *args, grid, warmup, **options):
 JITFunction.run = compile_only
 triton.autotune = lambda *_, **__: lambda kernel: kernel
 
+from raytran.geometry.camera import Cameras
+from raytran.geometry.grid import VoxelGrid
 from raytran.ops.block_attention import block_attention
+from raytran.ops.block_sum import block_sum
 from raytran.ops.pairs import PairList
+from raytran.ops.trace_blocks import trace_blocks
 
 generator = torch.Generator().manual_seed(0)
 for views in (2, 35):
@@ -45,6 +49,10 @@ for views in (2, 35):
         sizes = (128, views * 64, views * 64) if to_voxels else (views * 64, 128, 128)
         inputs = [torch.zeros(n, 2, 32, dtype=torch.bfloat16, requires_grad=True) for n in sizes]
         block_attention(*inputs, pairs.blocks(), to_voxels=to_voxels).sum().backward()
+    features = torch.zeros(views * 64, 32, dtype=torch.bfloat16, requires_grad=True)
+    block_sum(features, pairs.blocks()).sum().backward()
+    cameras = Cameras(torch.eye(3).expand(views, 3, 3), torch.eye(4).expand(views, 4, 4), (64, 256))
+    trace_blocks(cameras, VoxelGrid((8, 4, 4), (8.0, 4.0, 4.0), torch.zeros(3)), (4, 16), 2, capacity=1024)
 for name, codes in compiled.items():
     products = [code.count("mma.sync") + code.count("wgmma.mma_async") for code in codes]
     print(name, len(codes), min(products))
@@ -66,15 +74,13 @@ def test_kernels_compile_for_a_hopper_gpu_and_once_for_any_number_of_views():
         name: (int(codes), int(products))
         for name, codes, products in map(str.split, result.stdout.splitlines())
     }
-    # Once for either direction: 2 and 35 views use the same code.
-    assert {name: codes for name, (codes, _) in found.items()} == dict.fromkeys(
-        (
-            "attend_forward",
-            "attend_backward_targets",
-            "attend_backward_sources",
-            "merge_forward",
-            "merge_sums",
-        ),
-        2,
-    )
-    assert all((products > 0) == ("attend" in name) for name, (_, products) in found.items())  # tensor cores
+    # Once for either direction, and block_sum's once for either dtype: 2 and 35 views use the same code.
+    attention = ("attend_forward", "attend_backward_targets", "attend_backward_sources", "sum_boxes")
+    traversal = ("touch_blocks", "list_blocks", "mask_blocks")
+    assert {name: codes for name, (codes, _) in found.items()} == {
+        **dict.fromkeys((*attention, "merge_forward"), 2),
+        "merge_sums": 4,
+        **dict.fromkeys(traversal, 1),
+    }
+    for name in attention[:3]:
+        assert found[name][1] > 0  # products on tensor cores

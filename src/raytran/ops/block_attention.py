@@ -58,20 +58,22 @@ def block_attention(
         key,
         value,
         blocks.masks,
-        _tensors(by_target),
-        _tensors(by_source),
+        tensors_of(by_target),
+        tensors_of(by_source),
         [by_target.num_slots, by_source.num_slots],
-        _layout(targets),
-        _layout(sources),
+        layout_of(targets),
+        layout_of(sources),
     )
     return out
 
 
-def _tensors(order: BlockOrder) -> list[Tensor]:
+def tensors_of(order: BlockOrder) -> list[Tensor]:
+    """Return an order as an operator takes it."""
     return [order.source_start, order.place, order.items, order.merges]
 
 
-def _layout(tiling: Tiling) -> list[int]:
+def layout_of(tiling: Tiling) -> list[int]:
+    """Return the sizes of a grid and of its boxes as an operator takes them."""
     return [*tiling.shape[1:], *tiling.tile]
 
 
@@ -89,11 +91,11 @@ def _attend(
 ) -> tuple[Tensor, Tensor]:
     """Return the result ``(T, H, D)`` and the log-sum-exp ``(T, H)`` float32, to base 2."""
     query, key, value = query.contiguous(), key.contiguous(), value.contiguous()
-    launch = _Launch(query, key, by_target, num_slots[0], targets, sources)
+    launch = Launch(query, key, by_target, num_slots[0], targets, sources)
     outputs = torch.empty_like(query), query.new_empty(query.shape[:2], dtype=torch.float32)
     parts = launch.scratch(query.shape[2]), launch.scratch(1)
     with torch.cuda.device_of(query):
-        _forward[launch.grid]((query, key, value), outputs, parts, launch.order(masks), *launch.sizes())
+        _forward[launch.grid]((query, key, value), outputs, parts, *launch.arguments(masks, query.dtype))
         launch.merge(merge_forward, outputs, parts)
     return outputs
 
@@ -115,23 +117,23 @@ def _attend_backward(
     d_query, d_key, d_value = torch.empty_like(query), torch.empty_like(key), torch.empty_like(value)
     delta = torch.empty_like(logsumexp)
     with torch.cuda.device_of(query):
-        launch = _Launch(query, key, by_target, num_slots[0], targets, sources)
+        launch = Launch(query, key, by_target, num_slots[0], targets, sources)
         part = launch.scratch(query.shape[2])
         _backward_targets[launch.grid](
-            inputs, logsumexp, (d_query, delta), part, launch.order(masks), *launch.sizes()
+            inputs, logsumexp, (d_query, delta), part, *launch.arguments(masks, query.dtype)
         )
         launch.merge(merge_sums, d_query, part)
-        launch = _Launch(key, query, by_source, num_slots[1], sources, targets)
+        launch = Launch(key, query, by_source, num_slots[1], sources, targets)
         parts = launch.scratch(query.shape[2]), launch.scratch(query.shape[2])
         _backward_sources[launch.grid](
-            inputs, (logsumexp, delta), (d_key, d_value), parts, launch.order(masks), *launch.sizes()
+            inputs, (logsumexp, delta), (d_key, d_value), parts, *launch.arguments(masks, query.dtype)
         )
         launch.merge(merge_sums, d_key, parts[0])
         launch.merge(merge_sums, d_value, parts[1])
     return d_query, d_key, d_value
 
 
-class _Launch:
+class Launch:
     """What the kernels of one pass along rows are launched with.
 
     Args:
@@ -155,9 +157,9 @@ class _Launch:
         self._row, self._order, self._num_slots = row, order, num_slots
         _, self._heads, self._dim = row.shape
         self._shape, self._tile, other_tile = tuple(rows[:3]), tuple(rows[3:]), tuple(others[3:])
-        self._tiles = self._tile, other_tile
-        self._sizes = self._shape, tuple(others[:3]), row.shape[0], other.shape[0], self._heads
         self._width = max(16, triton.next_power_of_2(self._dim))
+        self._sizes = self._shape, tuple(others[:3]), row.shape[0], other.shape[0], self._heads
+        self._constants = (self._tile, other_tile), self._dim, self._width
         self.grid = (order[2].shape[0] * self._heads,)
 
     def scratch(self, width: int) -> Tensor:
@@ -165,15 +167,11 @@ class _Launch:
         slots = self._tile[0] * self._tile[1] * self._tile[2] * self._num_slots
         return self._row.new_empty(slots * self._heads * width, dtype=torch.float32)
 
-    def order(self, masks: Tensor) -> tuple[Tensor, ...]:
-        """Return the kernels' ``order``."""
-        return *self._order[:3], masks
-
-    def sizes(self) -> tuple[Any, ...]:
-        """Return the kernels' arguments from ``sizes`` on."""
+    def arguments(self, masks: Tensor, dtype: torch.dtype) -> tuple[Any, ...]:
+        """Return the kernels' arguments from ``order`` on, for inputs of a dtype."""
         # The interpreter multiplies float32 alone rightly; elsewhere operands stay what they are.
-        operand = tl.float32 if INTERPRETED else _OPERANDS[self._row.dtype]
-        return self._sizes, self._dim**-0.5, self._tiles, self._dim, self._width, operand
+        operand = tl.float32 if INTERPRETED else _OPERANDS[dtype]
+        return (*self._order[:3], masks), self._sizes, *self._constants, operand
 
     def merge(self, kernel: Any, result: Any, parts: Any) -> None:
         """Put the pieces of long rows together."""

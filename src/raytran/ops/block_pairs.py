@@ -181,6 +181,22 @@ class BlockPairs(Parcel):
         both = (pixel_index * self.num_voxels + voxel_index).sort().values
         return both // self.num_voxels, both % self.num_voxels
 
+    def pixels_per_voxel(self) -> Tensor:
+        """Return with how many pixels each voxel is paired, ``(num_voxels,)`` int64; made once and kept."""
+        return kept(self, "_pixels_per_voxel", self._count_pixels)
+
+    def _count_pixels(self) -> Tensor:
+        # Bits are added up in pairs, nibbles, bytes ("Hacker's Delight" §5-1).
+        bits = self.masks.long() & 0xFFFFFFFF
+        bits = bits - ((bits >> 1) & 0x55555555)
+        bits = (bits & 0x33333333) + ((bits >> 2) & 0x33333333)
+        bits = (((bits + (bits >> 4)) & 0x0F0F0F0F) * 0x01010101 >> 24) & 0xFF
+        slot = torch.arange(VOXELS, device=bits.device)
+        voxel = self.voxels.start(self._block)[:, None] + self.voxels.offset(slot)
+        # Slots over the edge of the grid count nothing, wherever that is added.
+        voxel = voxel.clamp_(max=max(self.num_voxels - 1, 0))
+        return bits.new_zeros(self.num_voxels).index_add_(0, voxel.flatten(), bits.flatten())
+
     def by(self, rows: Literal["pixels", "voxels"]) -> BlockOrder:
         """Return the pairs in rows, one per pixel tile or one per voxel block; made once and kept."""
         if rows == "pixels":

@@ -8,10 +8,6 @@ all scores, and the same input gives the same bits.
 
 from __future__ import annotations
 
-import logging
-import os
-from functools import cache
-from importlib.util import find_spec
 from typing import Literal
 
 import torch
@@ -19,17 +15,11 @@ from torch import Tensor
 
 from raytran.errors import check_shape
 from raytran.ops.block_pairs import BlockPairs
+from raytran.ops.fused import fused_blocks, listed
 from raytran.ops.pair_attention import pair_attention
 from raytran.ops.pairs import PairList
 
 Direction = Literal["pixels_to_voxels", "voxels_to_pixels"]
-
-_FUSED = (torch.float16, torch.bfloat16, torch.float32)
-
-_INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
-"""Triton's kernels run on any device, slowly, to be tested; only ``BlockPairs`` ask for that."""
-
-_log = logging.getLogger(__name__)
 
 
 def ray_attention(
@@ -66,37 +56,16 @@ def ray_attention(
     check_shape(key, f"{sources} {query.shape[1]} {query.shape[2]}", "key")
     check_shape(value, f"{sources} {query.shape[1]} {query.shape[2]}", "value")
     dtype = torch.promote_types(torch.promote_types(query.dtype, key.dtype), value.dtype)
-    if _runs_fused(pairs, query.device, dtype):
+    blocks = fused_blocks(pairs, query.device, dtype)
+    if blocks is not None:
         # CPU installations of torch lack Triton: its module is imported only where it runs.
         from raytran.ops.block_attention import block_attention
 
-        blocks = pairs.blocks() if isinstance(pairs, PairList) else pairs
         out = block_attention(query.to(dtype), key.to(dtype), value.to(dtype), blocks, to_voxels=to_voxels)
         return out.to(query.dtype)
     dtype = torch.promote_types(dtype, torch.float32)
-    pairs = PairList.from_blocks(pairs) if isinstance(pairs, BlockPairs) else pairs
+    pairs = listed(pairs)
     by_target = pairs.by("voxels" if to_voxels else "pixels")
     by_source = pairs.by("pixels" if to_voxels else "voxels")
     out = pair_attention(query.to(dtype), key.to(dtype), value.to(dtype), by_target, by_source)
     return out.to(query.dtype)
-
-
-def _runs_fused(pairs: PairList | BlockPairs, device: torch.device, dtype: torch.dtype) -> bool:
-    """Return whether the fused kernels take this input; if not, say once why."""
-    on_gpu = device.type == "cuda"
-    if not on_gpu and not (_INTERPRETED and isinstance(pairs, BlockPairs)):
-        reason = f"tensors are on the {device.type.upper()}"
-    elif find_spec("triton") is None:
-        reason = "Triton is not installed"
-    elif dtype not in _FUSED:
-        reason = f"tensors are {dtype}"
-    else:
-        return True
-    if not torch.compiler.is_compiling():
-        _log_once(logging.WARNING if on_gpu else logging.DEBUG, reason)
-    return False
-
-
-@cache
-def _log_once(level: int, reason: str) -> None:
-    _log.log(level, "ray-traced attention runs by torch.sparse and not in fused kernels: %s", reason)

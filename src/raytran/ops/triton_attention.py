@@ -108,7 +108,6 @@ def attend_forward(
     parts: tl.tuple,
     order: tl.tuple,
     sizes: tl.tuple,
-    scale: tl.tensor,
     TILES: tl.constexpr,
     DIM: tl.constexpr,
     WIDTH: tl.constexpr,
@@ -116,6 +115,7 @@ def attend_forward(
 ) -> None:
     """Give a row's targets the mean of the values they attend to, and the log-sum-exp of their scores."""
     ROWS: tl.constexpr = TILES[0][0] * TILES[0][1] * TILES[0][2]
+    scale: tl.constexpr = DIM**-0.5
     heads = sizes[4]
     item_ptr, head = order[2] + tl.program_id(0) // heads * 4, tl.program_id(0) % heads
     start, slot = tl.load(item_ptr), tl.load(item_ptr + 3)

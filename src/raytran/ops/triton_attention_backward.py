@@ -25,7 +25,6 @@ def attend_backward_targets(
     part_ptr: tl.tensor,
     order: tl.tuple,
     sizes: tl.tuple,
-    scale: tl.tensor,
     TILES: tl.constexpr,
     DIM: tl.constexpr,
     WIDTH: tl.constexpr,
@@ -37,6 +36,7 @@ def attend_backward_targets(
     ``outputs`` are the gradient of the queries and that sum.
     """
     ROWS: tl.constexpr = TILES[0][0] * TILES[0][1] * TILES[0][2]
+    scale: tl.constexpr = DIM**-0.5
     heads = sizes[4]
     item_ptr, head = order[2] + tl.program_id(0) // heads * 4, tl.program_id(0) % heads
     start, slot = tl.load(item_ptr), tl.load(item_ptr + 3)
@@ -78,7 +78,6 @@ def attend_backward_sources(
     parts: tl.tuple,
     order: tl.tuple,
     sizes: tl.tuple,
-    scale: tl.tensor,
     TILES: tl.constexpr,
     DIM: tl.constexpr,
     WIDTH: tl.constexpr,
@@ -90,6 +89,7 @@ def attend_backward_sources(
     of ``attend_backward_targets``; ``sizes`` and ``TILES`` name the rows' grid, the sources', first.
     """
     ROWS: tl.constexpr = TILES[0][0] * TILES[0][1] * TILES[0][2]
+    scale: tl.constexpr = DIM**-0.5
     heads = sizes[4]
     item_ptr, head = order[2] + tl.program_id(0) // heads * 4, tl.program_id(0) % heads
     start, slot = tl.load(item_ptr), tl.load(item_ptr + 3)
