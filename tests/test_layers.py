@@ -18,7 +18,7 @@ LAYERS: list[set[str]] = [
     {"export", "view"},
     {"training"},
     {"run"},
-    {"train", "curriculum", "evaluate", "predict", "prepare", "demo"},
+    {"train", "curriculum", "evaluate", "predict", "prepare", "plan", "demo"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 NEEDS_TRAINING = {"lightning", "hydra", "wandb"}
