@@ -92,7 +92,8 @@ def _start(
         pixels.append(backbone.embed(chunk, some, grid))
         pairs = trace(some)
         mean, _ = splat_features(pixels[-1].flatten(0, 2), pairs)
-        met = torch.bincount(pairs.voxel_index, minlength=pairs.num_voxels)
+        # Not torch.bincount, which makes a GPU's host wait for the largest index.
+        met = torch.zeros_like(count).index_add_(0, pairs.voxel_index, torch.ones_like(pairs.voxel_index))
         total += mean.to(total.dtype) * met[:, None]
         count += met
     splatted = (total / count.clamp(min=1)[:, None]).to(pixels[0].dtype)

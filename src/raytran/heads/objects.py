@@ -54,10 +54,10 @@ class ObjectHead(nn.Module):
         grid_extent: Sequence[float] = (9.0, 9.0, 3.5),
     ) -> None:
         super().__init__()
-        extent = torch.tensor([float(length) for length in grid_extent])
+        self.grid_extent = tuple(float(length) for length in grid_extent)
         # Sobol's points cover the volume more evenly than random ones, and are the same in every run.
         spread = SobolEngine(3).draw(num_queries + 1)[1:] - 0.5
-        self.register_buffer("extent", extent, persistent=False)
+        self.register_buffer("extent", torch.tensor(self.grid_extent), persistent=False)
         self.reference = nn.Parameter(0.8 * spread)
         self.query = nn.Parameter(QUERY_SCALE * torch.randn(num_queries, channels))
         self.position = nn.Linear(channels, channels)
@@ -91,7 +91,7 @@ class ObjectHead(nn.Module):
 
     def _locate(self, points: Tensor) -> Tensor:
         """Return the code ``(..., C)`` of points ``(..., 3)``, metres from the centre of the volume."""
-        return self.position(position_code(points, self.extent.tolist(), self.position.in_features))
+        return self.position(position_code(points, self.grid_extent, self.position.in_features))
 
 
 class ObjectPredictor(nn.Module):
