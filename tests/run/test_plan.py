@@ -30,9 +30,6 @@ def make_scan(folder: Path) -> Path:
         np.savetxt(folder / "pose" / f"{n}.txt", pose)
     intrinsic = [[60, 0, 32, 0], [0, 60, 24, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", intrinsic)
-        folder / "intrinsic" / "intrinsic_color.txt",
-        [[60, 0, 32, 0], [0, 60, 24, 0], [0, 0, 1, 0], [0, 0, 0, 1]],
-    )
     return folder
 
 
