@@ -9,7 +9,7 @@ from torch import Tensor
 
 from raytran.ops import reference
 from raytran.ops.pairs import PairList
-from raytran.ops.ray_attention import ray_attention
+from raytran.ops.ray_attention import ray_attention, ray_attention_with_sum
 
 pytest.importorskip("triton", reason="Triton is not installed: the fused kernels have nothing to run on")
 
@@ -163,6 +163,16 @@ def test_compile_and_export_pass_through(shaped_pairs, generator, direction):
     exported = torch.export.export(Module(), tuple(tensor.detach() for tensor in inputs))
     assert "raytran.block_attention" in str(exported.graph)
     assert torch.equal(exported.module()(*inputs), expected)
+
+
+@both_directions
+def test_sums_equal_those_over_the_pair_list(shaped_pairs, generator, direction):
+    pairs = shaped_pairs((34, 1, 3), (1, 4, 4, 2), 0.2)
+    inputs = _inputs(pairs, direction, 1, 16, generator)
+    _, actual = ray_attention_with_sum(*inputs, pairs.blocks().to(DEVICE), direction)
+    _, expected = ray_attention_with_sum(*(tensor.cpu() for tensor in inputs), pairs, direction)
+    torch.testing.assert_close(actual.cpu(), expected)
+    assert not actual.requires_grad
 
 
 def test_autocast_changes_nothing(shaped_pairs, generator):

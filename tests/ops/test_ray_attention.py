@@ -8,7 +8,7 @@ from torch import Tensor
 from raytran.errors import ShapeError
 from raytran.ops import fused, pair_attention, reference
 from raytran.ops.pairs import PairList
-from raytran.ops.ray_attention import ray_attention
+from raytran.ops.ray_attention import ray_attention, ray_attention_with_sum
 
 DIRECTIONS = ("pixels_to_voxels", "voxels_to_pixels")
 both_directions = pytest.mark.parametrize("direction", DIRECTIONS)
@@ -132,18 +132,49 @@ def test_autocast_leaves_float32_input_exact(random_pairs, generator, direction)
             assert torch.equal(mine, theirs)
 
 
-def test_keeps_nothing_of_the_size_of_the_pairs_but_the_softmax_weights(random_pairs, generator):
+def test_keeps_nothing_of_the_size_of_the_pairs_but_their_exponentials(random_pairs, generator):
     pairs = random_pairs(40, 50, 0.5)
     inputs = _inputs(pairs, "pixels_to_voxels", 4, 3, generator)
     kept: list[Tensor] = []
     with torch.autograd.graph.saved_tensors_hooks(
         lambda tensor: kept.append(tensor) or tensor, lambda tensor: tensor
     ):
-        ray_attention(*inputs, pairs)
+        out = ray_attention(*inputs, pairs)
     known = {t.data_ptr() for order in (pairs.by("pixels"), pairs.by("voxels")) for t in order}
-    known |= {tensor.data_ptr() for tensor in inputs}
-    extra = [tensor for tensor in kept if tensor.data_ptr() not in known]
-    assert [tensor.numel() for tensor in extra] == [4 * len(pairs)]
+    known |= {tensor.data_ptr() for tensor in (*inputs, out)}
+    extra = [tensor.numel() for tensor in kept if tensor.data_ptr() not in known]
+    assert sorted(extra) == [4 * 50, 4 * len(pairs)]  # the sums of the softmax, and its exponentials
+
+
+@both_directions
+def test_sums_put_results_over_parts_of_the_sources_together(random_pairs, generator, direction):
+    pairs = random_pairs(12, 10, 0.6)
+    some = torch.arange(len(pairs)) % 3 == 0
+    parts = [PairList(pairs.pixel_index[mine], pairs.voxel_index[mine], 12, 10) for mine in (some, ~some)]
+    inputs = _inputs(pairs, direction, 2, 4, generator)
+    (one, weight_of_one), (other, weight_of_other) = (
+        ray_attention_with_sum(*inputs, part, direction) for part in parts
+    )
+    together = torch.logaddexp(weight_of_one, weight_of_other)
+    expected, weight = ray_attention_with_sum(*inputs, pairs, direction)
+    torch.testing.assert_close(together, weight)
+    assert (weight == -torch.inf).any()
+    shares = [(part - together).exp().nan_to_num()[..., None] for part in (weight_of_one, weight_of_other)]
+    torch.testing.assert_close(one * shares[0] + other * shares[1], expected)
+    assert not weight.requires_grad
+
+
+@both_directions
+def test_scores_far_apart_keep_their_precision(random_pairs, generator, direction):
+    # One target's scores are hundreds below another's: no shift of all could serve both.
+    pairs = random_pairs(12, 10, 0.6)
+    query, key, value = (tensor.detach() for tensor in _inputs(pairs, direction, 1, 4, generator))
+    query = query * torch.logspace(0, 3, len(query))[:, None, None]
+    exact = reference.ray_attention(query.double(), key.double(), value.double(), pairs, direction)
+    torch.testing.assert_close(
+        ray_attention(query, key, value, pairs, direction), exact.float(), atol=1e-3, rtol=0
+    )
+    assert torch.isfinite(exact).all()
 
 
 def test_operator_is_registered_as_torch_wants_it(random_pairs, generator):

@@ -49,11 +49,16 @@ _forward, _backward_targets, _backward_sources = map(
 
 def block_attention(
     query: Tensor, key: Tensor, value: Tensor, blocks: BlockPairs, *, to_voxels: bool
-) -> Tensor:
-    """Let each target attend to its sources: ``ray_attention`` for tensors of one dtype, of 16 or 32 bits."""
+) -> tuple[Tensor, Tensor]:
+    """Let each target attend to its sources: ``ray_attention`` for tensors of one dtype of 16 or 32 bits.
+
+    Returns:
+        ``(T, H, D)``, and ``(T, H)`` float32 the logarithm to base 2 of the sum of a target's exponentials,
+        +inf for a target with no pair.
+    """
     sides = [(blocks.voxels, blocks.by("voxels")), (blocks.pixels, blocks.by("pixels"))]
     (targets, by_target), (sources, by_source) = sides if to_voxels else sides[::-1]
-    out, _ = _attend(
+    return _attend(
         query,
         key,
         value,
@@ -64,7 +69,6 @@ def block_attention(
         layout_of(targets),
         layout_of(sources),
     )
-    return out
 
 
 def tensors_of(order: BlockOrder) -> list[Tensor]:
@@ -89,7 +93,7 @@ def _attend(
     targets: Sequence[int],
     sources: Sequence[int],
 ) -> tuple[Tensor, Tensor]:
-    """Return the result ``(T, H, D)`` and the log-sum-exp ``(T, H)`` float32, to base 2."""
+    """Return the result ``(T, H, D)`` and the log-sum-exp ``(T, H)`` float32, as ``block_attention`` does."""
     query, key, value = query.contiguous(), key.contiguous(), value.contiguous()
     launch = Launch(query, key, by_target, num_slots[0], targets, sources)
     outputs = torch.empty_like(query), query.new_empty(query.shape[:2], dtype=torch.float32)
@@ -196,6 +200,7 @@ def _(grad: Tensor, saved: Sequence[Tensor], *_: Any) -> tuple[Tensor, Tensor, T
 
 def _keep(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
     query, key, value, masks, by_target, by_source, *ctx.layout = inputs
+    ctx.mark_non_differentiable(output[1])
     ctx.save_for_backward(query, key, value, *output, masks, *by_target, *by_source)
 
 

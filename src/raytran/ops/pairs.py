@@ -23,12 +23,13 @@ class PairOrder(NamedTuple):
     Attributes:
         row_offsets: ``(rows + 1,)`` int32; the pairs of row ``r`` are ``row_offsets[r]:row_offsets[r + 1]``.
         col_index: ``(P,)`` int32, the other side of each pair, rising within a row.
-        permutation: ``(P,)`` int64, the place of each pair in ``PairList.pixel_index``.
+        turn: ``(P,)`` int64, the place of each pair in the order by the other side: ``values[turn]`` brings
+            values from that order into this one.
     """
 
     row_offsets: Tensor
     col_index: Tensor
-    permutation: Tensor
+    turn: Tensor
 
 
 @dataclass(frozen=True)
@@ -84,6 +85,10 @@ class PairList(Parcel):
             return kept(self, "_by_voxels", self._order_by_voxels)
         raise ValueError(f"rows must be 'pixels' or 'voxels', got {rows!r}")
 
+    def pixels_per_voxel(self) -> Tensor:
+        """Return with how many pixels each voxel is paired, ``(num_voxels,)`` int32."""
+        return self.by("voxels").row_offsets.diff()
+
     def blocks(self) -> BlockPairs:
         """Return the pairs as masks of pixel tiles and voxel blocks; made once and kept."""
         return kept(self, "_blocks", self._gather_blocks)
@@ -94,8 +99,10 @@ class PairList(Parcel):
         return BlockPairs.from_index(self.pixel_index, self.voxel_index, pixels, voxels)
 
     def _order_by_pixels(self) -> PairOrder:
-        place = torch.arange(len(self), device=self.pixel_index.device)
-        return PairOrder(_offsets(self.pixel_index, self.num_pixels), self.voxel_index.int(), place)
+        place = self.by("voxels").turn
+        turn = torch.empty_like(place)
+        turn[place] = torch.arange(len(self), device=place.device)
+        return PairOrder(_offsets(self.pixel_index, self.num_pixels), self.voxel_index.int(), turn)
 
     def _order_by_voxels(self) -> PairOrder:
         # Stable, so that pixels rise within a voxel and the order of every sum is fixed.

@@ -8,6 +8,7 @@ all scores, and the same input gives the same bits.
 
 from __future__ import annotations
 
+from math import log
 from typing import Literal
 
 import torch
@@ -48,6 +49,34 @@ def ray_attention(
     Raises:
         ShapeError: the numbers of targets or sources are not those of ``pairs``.
     """
+    return _attend(query, key, value, pairs, direction)[0]
+
+
+def ray_attention_with_sum(
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    pairs: PairList | BlockPairs,
+    direction: Direction = "pixels_to_voxels",
+) -> tuple[Tensor, Tensor]:
+    """Return ``ray_attention`` and the weight of each result beside those over other sources.
+
+    Arguments and errors are those of ``ray_attention``.
+
+    Returns:
+        ``(T, H, D)``, and ``(T, H)`` ``log Σ_s exp(query[t]·key[s] / √D)``, in float32 at least; -inf for a
+        target with no pair. The latter has no gradient.
+    """
+    out, logsumexp, to_base_2 = _attend(query, key, value, pairs, direction)
+    if to_base_2:
+        logsumexp = (logsumexp * log(2)).masked_fill_(logsumexp == torch.inf, -torch.inf)
+    return out, logsumexp
+
+
+def _attend(
+    query: Tensor, key: Tensor, value: Tensor, pairs: PairList | BlockPairs, direction: Direction
+) -> tuple[Tensor, Tensor, bool]:
+    """Return the result, its log-sum-exp as the implementation gives it, and whether that is to base 2."""
     if direction not in ("pixels_to_voxels", "voxels_to_pixels"):
         raise ValueError(f"direction must be 'pixels_to_voxels' or 'voxels_to_pixels', got {direction!r}")
     to_voxels = direction == "pixels_to_voxels"
@@ -61,11 +90,12 @@ def ray_attention(
         # CPU installations of torch lack Triton: its module is imported only where it runs.
         from raytran.ops.block_attention import block_attention
 
-        out = block_attention(query.to(dtype), key.to(dtype), value.to(dtype), blocks, to_voxels=to_voxels)
-        return out.to(query.dtype)
+        qkv = query.to(dtype), key.to(dtype), value.to(dtype)
+        out, logsumexp = block_attention(*qkv, blocks, to_voxels=to_voxels)
+        return out.to(query.dtype), logsumexp, True
     dtype = torch.promote_types(dtype, torch.float32)
     pairs = listed(pairs)
     by_target = pairs.by("voxels" if to_voxels else "pixels")
     by_source = pairs.by("pixels" if to_voxels else "voxels")
-    out = pair_attention(query.to(dtype), key.to(dtype), value.to(dtype), by_target, by_source)
-    return out.to(query.dtype)
+    out, logsumexp = pair_attention(query.to(dtype), key.to(dtype), value.to(dtype), by_target, by_source)
+    return out.to(query.dtype), logsumexp, False
