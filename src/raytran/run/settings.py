@@ -25,6 +25,7 @@ class RunConfig:
         output_dir: folder of this run.
         init_from: ``auto``, ``none``, or a checkpoint whose weights to start from.
         resume: ``none``, ``auto``, or the checkpoint of an interrupted run to continue.
+        compile: run the network through ``torch.compile``.
         checkpoint_every: optimiser steps between two writings of the last checkpoint.
         progress_bar: ``rich``, ``tqdm`` or ``none``.
     """
@@ -36,6 +37,7 @@ class RunConfig:
     output_dir: str
     init_from: str
     resume: str
+    compile: bool
     checkpoint_every: int
     progress_bar: str
 
