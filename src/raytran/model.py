@@ -18,8 +18,9 @@ from raytran.backbone.chunked import run_in_chunks
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.heads.slots import objects_of_slots
+from raytran.ops.block_pairs import BlockPairs
 from raytran.ops.pairs import PairList
-from raytran.ops.traverse import trace_pairs
+from raytran.ops.ray_tracer import RayTracer
 from raytran.types import ObjectSet, RawScene, ScenePrediction, Views
 
 TASKS = ("occupancy", "foreground", "objects")
@@ -54,6 +55,7 @@ class RayTran(nn.Module):
         self.grid_resolution = (int(grid_resolution[0]), int(grid_resolution[1]), int(grid_resolution[2]))
         self.grid_extent = (float(grid_extent[0]), float(grid_extent[1]), float(grid_extent[2]))
         self.rays_per_cell = rays_per_cell
+        self.ray_tracer = RayTracer()
 
     def forward(
         self,
@@ -95,9 +97,9 @@ class RayTran(nn.Module):
     ) -> tuple[Tensor, Tensor | None]:
         """Run the backbone: voxel features, and pixel features if they are wanted."""
 
-        def trace(some: Cameras) -> PairList:
+        def trace(some: Cameras) -> PairList | BlockPairs:
             size = (images.shape[-2] // STRIDE, images.shape[-1] // STRIDE)
-            return trace_pairs(some, grid, size, self.rays_per_cell)
+            return self.ray_tracer(some, grid, size, self.rays_per_cell)
 
         if views_at_once is None or views_at_once >= images.shape[1]:
             return self.backbone(images, cameras, grid, trace(cameras), with_pixels=with_pixels)

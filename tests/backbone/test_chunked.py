@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from raytran.backbone.backbone import Backbone
-from raytran.backbone.chunked import log_sum_exp, run_in_chunks
+from raytran.backbone.chunked import run_in_chunks
 from raytran.backbone.resnet import ResNet18
 from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
@@ -69,16 +69,6 @@ def test_no_more_views_pass_together_than_were_asked_for(generator: torch.Genera
 
     run_in_chunks(backbone, *inputs.values(), trace, views_at_once=2)
     assert max(seen) == 2
-
-
-def test_log_sum_exp_by_hand(generator: torch.Generator) -> None:
-    query, key = torch.randn(3, 2, 4, generator=generator), torch.randn(4, 2, 4, generator=generator)
-    pairs = PairList(torch.tensor([0, 1, 3]), torch.tensor([2, 0, 2]), 4, 3)
-    found = log_sum_exp(query, key, pairs)
-    score = torch.einsum("thd,shd->tsh", query, key) / 2
-    torch.testing.assert_close(found[0], score[0, 1])
-    torch.testing.assert_close(found[2], score[2, [0, 3]].logsumexp(dim=0))
-    assert (found[1] == -torch.inf).all()
 
 
 def test_refused_in_training_and_without_a_view(generator: torch.Generator) -> None:

@@ -6,7 +6,7 @@ import torch
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 import raytran.backbone.block
-import raytran.model
+import raytran.ops.ray_tracer
 from raytran.run.build import build_model
 from raytran.run.dry_run import LiveMemory, fake_copy, peak_bytes, stand_ins
 from raytran.run.entry import compose
@@ -53,13 +53,13 @@ def test_a_fake_copy_leaves_the_original_alone() -> None:
 
 
 def test_stand_ins_are_taken_back_after_an_error() -> None:
-    real = raytran.model.trace_pairs, raytran.backbone.block.ray_attention
+    real = raytran.ops.ray_tracer.trace_pairs, raytran.backbone.block.ray_attention
 
     def fail() -> None:
         with stand_ins(3.0, fused=True):
-            assert raytran.model.trace_pairs is not real[0]
+            assert raytran.ops.ray_tracer.trace_pairs is not real[0]
             raise RuntimeError("stop")
 
     with pytest.raises(RuntimeError, match="stop"):
         fail()
-    assert (raytran.model.trace_pairs, raytran.backbone.block.ray_attention) == real
+    assert (raytran.ops.ray_tracer.trace_pairs, raytran.backbone.block.ray_attention) == real

@@ -15,6 +15,7 @@ from raytran.errors import ConfigError, ShapeError, check_shape
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.position import position_code
+from raytran.ops.block_pairs import BlockPairs
 from raytran.ops.pairs import PairList
 from raytran.ops.splat import splat_features
 
@@ -76,7 +77,13 @@ class Backbone(nn.Module):
         self.register_buffer("image_std", torch.tensor(scale[: resnet.input_channels]), persistent=False)
 
     def forward(
-        self, images: Tensor, cameras: Cameras, grid: VoxelGrid, pairs: PairList, *, with_pixels: bool = True
+        self,
+        images: Tensor,
+        cameras: Cameras,
+        grid: VoxelGrid,
+        pairs: PairList | BlockPairs,
+        *,
+        with_pixels: bool = True,
     ) -> tuple[Tensor, Tensor | None]:
         """Return features of the scene and of its views.
 
@@ -128,7 +135,12 @@ class Backbone(nn.Module):
         return (f"blocks.{len(self.blocks) - 1}.pixel_stream", "pixel_norm")
 
     def _run(
-        self, block: nn.Module, voxels: Tensor, pixels: Tensor, pairs: PairList, update_pixels: bool
+        self,
+        block: nn.Module,
+        voxels: Tensor,
+        pixels: Tensor,
+        pairs: PairList | BlockPairs,
+        update_pixels: bool,
     ) -> tuple[Tensor, Tensor]:
         if not (self.checkpoint_blocks and torch.is_grad_enabled()):
             return block(voxels, pixels, pairs, update_pixels=update_pixels)

@@ -7,6 +7,7 @@ from typing import Literal
 
 from torch import Tensor, nn
 
+from raytran.ops.block_pairs import BlockPairs
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_attention import Direction, ray_attention
 
@@ -35,7 +36,7 @@ class RayTracedBlock(nn.Module):
         )
 
     def forward(
-        self, voxels: Tensor, pixels: Tensor, pairs: PairList, *, update_pixels: bool = True
+        self, voxels: Tensor, pixels: Tensor, pairs: PairList | BlockPairs, *, update_pixels: bool = True
     ) -> tuple[Tensor, Tensor]:
         """Return the two representations after the block.
 
@@ -79,7 +80,7 @@ class Stream(nn.Module):
             channels=channels, hidden=expansion * channels, dimensions=dimensions
         )
 
-    def forward(self, stream: Tensor, target: Tensor, source: Tensor, pairs: PairList) -> Tensor:
+    def forward(self, stream: Tensor, target: Tensor, source: Tensor, pairs: PairList | BlockPairs) -> Tensor:
         """Return the stream after attention and feed-forward.
 
         Args:

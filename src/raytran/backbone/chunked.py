@@ -21,12 +21,12 @@ from raytran.backbone.block import RayTracedBlock
 from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
+from raytran.ops.block_pairs import BlockPairs
 from raytran.ops.pairs import PairList
-from raytran.ops.ray_attention import ray_attention
-from raytran.ops.segment import row_of_pair, sampled_product, segment_max, segment_sum
+from raytran.ops.ray_attention import ray_attention, ray_attention_with_sum
 from raytran.ops.splat import splat_features
 
-Trace = Callable[[Cameras], PairList]
+Trace = Callable[[Cameras], PairList | BlockPairs]
 """From the cameras ``(B, n)`` of a few views to their pixel-voxel pairs."""
 
 
@@ -92,8 +92,7 @@ def _start(
         pixels.append(backbone.embed(chunk, some, grid))
         pairs = trace(some)
         mean, _ = splat_features(pixels[-1].flatten(0, 2), pairs)
-        # Not torch.bincount, which makes a GPU's host wait for the largest index.
-        met = torch.zeros_like(count).index_add_(0, pairs.voxel_index, torch.ones_like(pairs.voxel_index))
+        met = pairs.pixels_per_voxel()
         total += mean.to(total.dtype) * met[:, None]
         count += met
     splatted = (total / count.clamp(min=1)[:, None]).to(pixels[0].dtype)
@@ -118,7 +117,7 @@ def _run_block(
     for index, (features, some) in enumerate(zip(pixels, cameras, strict=True)):
         pairs, pixel_input = trace(some), block.pixel_norm(features)
         key, value = to_voxels.keys_and_values(pixel_input)
-        softmax.add(ray_attention(query, key, value, pairs), log_sum_exp(query, key, pairs))
+        softmax.add(*ray_attention_with_sum(query, key, value, pairs))
         if update_pixels:
             pixel_query = to_pixels.heads(to_pixels.query(pixel_input))
             attended = ray_attention(pixel_query, voxel_key, voxel_value, pairs, "voxels_to_pixels")
@@ -145,25 +144,3 @@ class _OnlineSoftmax:
         share = torch.nan_to_num((log_weight - together).exp_())[..., None]
         self.mean.lerp_(mean.to(self.mean.dtype), share)
         self._log_weight = together
-
-
-def log_sum_exp(query: Tensor, key: Tensor, pairs: PairList) -> Tensor:
-    """Return the logarithm of the sum of a voxel's exponential scores, -inf without a pair.
-
-    Args:
-        query: ``(T, H, D)`` of the voxels.
-        key: ``(S, H, D)`` of the pixels.
-        pairs: which voxel sees which pixel.
-
-    Returns:
-        ``(T, H)``, float32 at least.
-    """
-    order, dtype = pairs.by("voxels"), torch.promote_types(query.dtype, torch.float32)
-    row, result = row_of_pair(order), torch.empty(query.shape[:2], dtype=dtype, device=query.device)
-    with torch.autocast(query.device.type, enabled=False):
-        for head in range(query.shape[1]):
-            scaled = query[:, head].to(dtype) * query.shape[2] ** -0.5
-            score = sampled_product(scaled, key[:, head].to(dtype), order)
-            peak = segment_max(score, order)
-            result[:, head] = segment_sum(score.sub_(peak[row]).exp_(), order).log_() + peak
-    return result

@@ -25,7 +25,7 @@ from torch.utils._pytree import tree_leaves
 import raytran.backbone.backbone
 import raytran.backbone.block
 import raytran.backbone.chunked
-import raytran.model
+import raytran.ops.ray_tracer
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.model import RayTran
@@ -111,14 +111,15 @@ def stand_ins(pairs_per_pixel: float, *, fused: bool) -> Iterator[None]:
     def splat_features(features: Tensor, pairs: PairList) -> tuple[Tensor, Tensor]:
         return _Splat.apply(features, pairs.num_voxels), torch.empty(pairs.num_voxels, dtype=torch.bool)
 
-    def log_sum_exp(query: Tensor, key: Tensor, pairs: PairList) -> Tensor:
-        return torch.empty(query.shape[:2], dtype=torch.float32)
+    def ray_attention_with_sum(*arguments: Any) -> tuple[Tensor, Tensor]:
+        out = ray_attention(*arguments)
+        return out, torch.empty(out.shape[:2], dtype=torch.float32)
 
     replaced = {
-        raytran.model: (trace_pairs,),
+        raytran.ops.ray_tracer: (trace_pairs,),
         raytran.backbone.block: (ray_attention,),
         raytran.backbone.backbone: (splat_features,),
-        raytran.backbone.chunked: (ray_attention, splat_features, log_sum_exp),
+        raytran.backbone.chunked: (ray_attention, splat_features, ray_attention_with_sum),
     }
     real = [(module, f.__name__, getattr(module, f.__name__)) for module, fs in replaced.items() for f in fs]
     try:
