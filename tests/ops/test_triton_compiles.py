@@ -48,7 +48,7 @@ for views in (2, 35):
     for to_voxels in (True, False):
         sizes = (128, views * 64, views * 64) if to_voxels else (views * 64, 128, 128)
         inputs = [torch.zeros(n, 2, 32, dtype=torch.bfloat16, requires_grad=True) for n in sizes]
-        block_attention(*inputs, pairs.blocks(), to_voxels=to_voxels).sum().backward()
+        block_attention(*inputs, pairs.blocks(), to_voxels=to_voxels)[0].sum().backward()
     features = torch.zeros(views * 64, 32, dtype=torch.bfloat16, requires_grad=True)
     block_sum(features, pairs.blocks()).sum().backward()
     cameras = Cameras(torch.eye(3).expand(views, 3, 3), torch.eye(4).expand(views, 4, 4), (64, 256))

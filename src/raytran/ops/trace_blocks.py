@@ -3,9 +3,11 @@
 
 It finds the same pairs as ``trace_pairs`` but never lists them. First every ray is tested against every
 block of voxels, then the rays of each tile that touches a block against its voxels. At the paper's size that
-is 59 million slab tests of blocks and, with 9,000 block pairs, 74 million of voxels. At 50 instructions each
-they are 6.6 G, 0.4 ms if an H200 starts the 17 T a second of its float64 units; the bytes (2.3 MB of rays,
-2.3 MB of masks, 0.5 MB of marks) take less than 10 µs. Work grows linearly with views.
+is 59 million slab tests of blocks and, with 12,500 block pairs, 103 million of voxels. At 80 and 72
+instructions each, counted in the code for an H200, they are 378 million instructions of a warp, 0.4 ms if all
+its schedulers are busy; the bytes (3 MB of rays, 3 MB of masks, 0.5 MB of marks) take less than 10 µs, and
+some hundred small launches for the rays and the orders 0.5 ms. Reckoned, not measured. Work grows linearly
+with views.
 
 How many block pairs there are only the GPU knows; ``ray_tracer`` says how the host need not wait to hear it.
 """

@@ -10,7 +10,11 @@ queries, one along the sources' rows those of keys and values. No two programs w
 place and the order of every sum is fixed, so that the same input gives the same bits.
 
 Per block pair and head that is 2 products forward and 3 + 4 backward, of 2·32·64·D operations each, and the
-mask's 256 bytes, which all heads share while the L2 cache holds them.
+mask's 256 bytes, which all heads share while the L2 cache holds them. What bounds it are neither bytes nor
+products but the instructions around them, 13 an element forward: with 32 channels in bfloat16 the code for an
+H200 takes 850 of a warp per block pair and head forward, 830 and 970 backward, and 12,500 block pairs of 8
+heads 0.09 + 0.2 ms if all schedulers are busy (the bytes of inputs and outputs: 0.015 + 0.03 ms). Reckoned
+from the compiled code, not measured.
 
 ``ROWS`` are the elements of a program's row: targets, or sources in ``attend_backward_sources``. ``DIM``
 channels of a head are padded to a power of two, ``WIDTH``. Logarithms are to base 2. Arguments that belong
@@ -115,7 +119,7 @@ def attend_forward(
 ) -> None:
     """Give a row's targets the mean of the values they attend to, and the log-sum-exp of their scores."""
     ROWS: tl.constexpr = TILES[0][0] * TILES[0][1] * TILES[0][2]
-    scale: tl.constexpr = DIM**-0.5
+    scale: tl.constexpr = DIM**-0.5 * LOG2_E
     heads = sizes[4]
     item_ptr, head = order[2] + tl.program_id(0) // heads * 4, tl.program_id(0) % heads
     start, slot = tl.load(item_ptr), tl.load(item_ptr + 3)
@@ -135,12 +139,13 @@ def attend_forward(
         exists = (source + others < sizes[3])[:, None] & is_channel
         key = load_box(inputs[1], source, other_places, exists, heads * DIM, OPERAND)
         value = load_box(inputs[2], source, other_places, exists, heads * DIM, OPERAND)
-        score = tl.dot(query, tl.trans(key), input_precision="ieee") * (scale * LOG2_E)
+        score = tl.dot(query, tl.trans(key), input_precision="ieee")
         score = tl.where(box_mask(order[3], tl.load(order[1] + pair), ROWS == 64), score, -float("inf"))
-        higher = tl.maximum(peak, tl.max(score, axis=1))
+        higher = tl.maximum(peak, tl.max(score, axis=1) * scale)
         # A target that has met no source yet has no peak to subtract.
         shift = tl.where(higher == -float("inf"), 0.0, higher)
-        weight, fade = tl.exp2(score - shift[:, None]), tl.exp2(peak - shift)
+        weight = tl.exp2(tl.fma(score, scale, -shift[:, None]))
+        fade = tl.exp2(peak - shift)
         total, peak = total * fade + tl.sum(weight, axis=1), higher
         weight = weight.to(inputs[2].dtype.element_ty).to(OPERAND)
         summed = tl.dot(weight, value, summed * fade[:, None], input_precision="ieee")

@@ -42,11 +42,14 @@ def _crossed(
         slope = tl.load(rays[1] + ray * 3 + axis, mask=there, other=0.0)[:, None]
         before = low[axis].to(tl.float64)[None, :] - origin
         behind = high[axis].to(tl.float64)[None, :] - origin
-        entry, leave = before * slope, behind * slope
         # A parallel ray is between the planes for ever or never; the lower belongs to the box.
-        between = tl.where((before <= 0) & (behind > 0), -float("inf"), float("inf"))
-        near = tl.maximum(near, tl.where(slope == 0, between, tl.minimum(entry, leave)))
-        far = tl.minimum(far, tl.where(slope == 0, float("inf"), tl.maximum(entry, leave)))
+        always = tl.where((before <= 0) & (behind > 0), -float("inf"), float("inf"))
+        entry = tl.where(slope > 0, before, behind) * slope
+        leave = tl.where(slope > 0, behind, before) * slope
+        entry = tl.where(slope == 0, always, entry)
+        leave = tl.where(slope == 0, float("inf"), leave)
+        # Nothing here is not a number, which tl.maximum and tl.minimum would look for.
+        near, far = tl.where(entry > near, entry, near), tl.where(leave < far, leave, far)
     return (near + tl.full((1,), NUDGE, tl.float64)[:, None] < far) & there[:, None]
 
 
