@@ -4,6 +4,7 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor
+from torch._dynamo.testing import CompileCounterWithBackend
 
 from raytran.errors import ShapeError
 from raytran.ops import fused, pair_attention, reference
@@ -203,6 +204,17 @@ def test_compile_and_export_pass_through(random_pairs, generator, direction):
     exported = torch.export.export(Module(), (*(tensor.detach() for tensor in inputs), *index))
     assert "raytran.pair_attention" in str(exported.graph)
     assert torch.equal(exported.module()(*inputs, *index), expected)
+
+
+def test_another_number_of_pairs_needs_no_new_code(random_pairs, generator):
+    counter = CompileCounterWithBackend("aot_eager")
+    compiled = torch.compile(ray_attention, backend=counter, fullgraph=True)
+    for density in (0.3, 0.4, 0.5, 0.6):
+        pairs = random_pairs(9, 14, density)
+        pairs.by("pixels"), pairs.by("voxels")
+        inputs = _inputs(pairs, "pixels_to_voxels", 2, 8, generator)
+        assert torch.equal(compiled(*inputs, pairs), ray_attention(*inputs, pairs))
+    assert counter.frame_count <= 2  # one for the first size, one for all others
 
 
 def test_blocks_on_a_cpu_run_by_torch_sparse(random_pairs, generator, monkeypatch, caplog):

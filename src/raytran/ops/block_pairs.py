@@ -204,7 +204,7 @@ class BlockPairs(Parcel):
         return kept(self, "_by_voxels", self._order_by_voxels)
 
     def _order_by_pixels(self) -> BlockOrder:
-        place = torch.arange(len(self), device=self.key.device)
+        place = torch.arange(self.key.shape[0], device=self.key.device)
         return self._order(self._tile, self._block, place, self.pixels, self.voxels)
 
     def _order_by_voxels(self) -> BlockOrder:

@@ -101,7 +101,7 @@ class PairList(Parcel):
     def _order_by_pixels(self) -> PairOrder:
         place = self.by("voxels").turn
         turn = torch.empty_like(place)
-        turn[place] = torch.arange(len(self), device=place.device)
+        turn[place] = torch.arange(place.shape[0], device=place.device)
         return PairOrder(_offsets(self.pixel_index, self.num_pixels), self.voxel_index.int(), turn)
 
     def _order_by_voxels(self) -> PairOrder:

@@ -48,12 +48,22 @@ class RayTracer:
         self._most_per_tile = 0.0
         self._readings: list[_Reading] = []
 
+    @torch.compiler.disable
     def __call__(
         self, cameras: Cameras, grid: VoxelGrid, feature_size: tuple[int, int], rays_per_cell: int
     ) -> PairList | BlockPairs:
-        """Return the pairs of ``trace_pairs``; arguments and errors are its own."""
-        if not has_kernels(cameras.intrinsics.device):
-            return trace_pairs(cameras, grid, feature_size, rays_per_cell)
+        """Return the pairs of ``trace_pairs``, with both orders made; arguments and errors are its own."""
+        if has_kernels(cameras.intrinsics.device):
+            pairs: PairList | BlockPairs = self._trace_blocks(cameras, grid, feature_size, rays_per_cell)
+        else:
+            pairs = trace_pairs(cameras, grid, feature_size, rays_per_cell)
+        # Their sizes depend on the data: better here than in code compiled for one size.
+        pairs.by("pixels"), pairs.by("voxels")
+        return pairs
+
+    def _trace_blocks(
+        self, cameras: Cameras, grid: VoxelGrid, feature_size: tuple[int, int], rays_per_cell: int
+    ) -> BlockPairs:
         # CPU installations of torch lack Triton: its module is imported only where it runs.
         from raytran.ops.trace_blocks import trace_blocks
 
