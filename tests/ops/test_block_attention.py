@@ -6,6 +6,7 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor
+from torch._dynamo.testing import CompileCounterWithBackend
 
 from raytran.ops import reference
 from raytran.ops.pairs import PairList
@@ -163,6 +164,21 @@ def test_compile_and_export_pass_through(shaped_pairs, generator, direction):
     exported = torch.export.export(Module(), tuple(tensor.detach() for tensor in inputs))
     assert "raytran.block_attention" in str(exported.graph)
     assert torch.equal(exported.module()(*inputs), expected)
+
+
+@pytest.mark.parametrize("listed", [True, False], ids=["pair list", "blocks"])
+def test_another_number_of_views_needs_no_new_code(shaped_pairs, generator, listed):
+    counter = CompileCounterWithBackend("aot_eager")
+    compiled = torch.compile(ray_attention, backend=counter, fullgraph=True)
+    for views in (2, 3, 5):
+        pairs = shaped_pairs((views, 2, 4), (1, 4, 4, 4), 0.3).to(DEVICE)
+        blocks = pairs.blocks()
+        for made in (pairs, blocks):
+            made.by("pixels"), made.by("voxels")
+        pairs = pairs if listed else blocks
+        inputs = _inputs(pairs, "pixels_to_voxels", 1, 16, generator)
+        assert torch.equal(compiled(*inputs, pairs), ray_attention(*inputs, pairs))
+    assert counter.frame_count <= 2  # one for the first number, one for all others
 
 
 @both_directions

@@ -81,9 +81,12 @@ def _attend(
         raise ValueError(f"direction must be 'pixels_to_voxels' or 'voxels_to_pixels', got {direction!r}")
     to_voxels = direction == "pixels_to_voxels"
     targets, sources = (pairs.num_voxels, pairs.num_pixels)[:: 1 if to_voxels else -1]
-    check_shape(query, f"{targets} H D", "query")
-    check_shape(key, f"{sources} {query.shape[1]} {query.shape[2]}", "key")
-    check_shape(value, f"{sources} {query.shape[1]} {query.shape[2]}", "value")
+    if query.ndim != 3 or query.shape[0] != targets:
+        check_shape(query, f"{targets} H D", "query")
+    for name, tensor in (("key", key), ("value", value)):
+        # Words are made of sizes only to complain: torch.compile cannot make them of sizes that change.
+        if tensor.shape != (sources, *query.shape[1:]):
+            check_shape(tensor, f"{sources} {query.shape[1]} {query.shape[2]}", name)
     dtype = torch.promote_types(torch.promote_types(query.dtype, key.dtype), value.dtype)
     blocks = fused_blocks(pairs, query.device, dtype)
     if blocks is not None:

@@ -32,7 +32,8 @@ def splat_features(features: Tensor, pairs: PairList | BlockPairs) -> tuple[Tens
     Raises:
         ShapeError: the number of pixels is not that of ``pairs``.
     """
-    check_shape(features, f"{pairs.num_pixels} C", "features")
+    if features.ndim != 2 or features.shape[0] != pairs.num_pixels:
+        check_shape(features, f"{pairs.num_pixels} C", "features")
     blocks = fused_blocks(pairs, features.device, features.dtype)
     if blocks is not None:
         # CPU installations of torch lack Triton: its module is imported only where it runs.
