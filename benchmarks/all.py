@@ -49,13 +49,14 @@ def commands(*, gpu: bool, quick: bool) -> list[list[str]]:
     presets = ["tiny"] if quick else ["raytran", "small", "tiny"] if gpu else ["tiny", "raytran"]
     dtypes = ["float32", "bfloat16"] if gpu else ["float32"]
     baselines = ["gather", "dense", "flex"] if gpu else ["gather", "dense"]
+    against = ["--baselines", *(name for name in baselines if name != "dense")]
     attention = ["ray_attention.py", "--dtype", *dtypes]
     one_size = ["--views", views[0], "--resolution", grids[0] if quick else grids[1]]
     return [
         [*attention, *one_size, "--baselines", *baselines, "--name", "attention"],
         ["traversal.py", "--views", *views],
         *(["step.py", "--preset", preset] for preset in presets),
-        [*attention, "--views", *views, "--baselines", "--name", "attention-views"],
+        [*attention, "--views", *views, *against, "--name", "attention-views"],
         [
             *attention,
             "--views",

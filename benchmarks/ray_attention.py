@@ -117,18 +117,24 @@ class Case:
         )
 
     def baselines(self, names: list[str], share: float) -> dict[str, tuple[Attention, float]]:
-        """Return the baselines of these names, each checked against ours, and its share of the work."""
+        """Return the baselines that run, each checked against ours, with its share of the work."""
+        makers = {
+            "gather": ("gather + segment softmax", self.gather),
+            "flex": ("FlexAttention", self.flex),
+        }
         out = self.ours()(*self.tensors).float()
         tolerance = {"atol": 1e-5 if self.tensors[0].dtype == torch.float32 else 3e-2, "rtol": 0}
         found: dict[str, tuple[Attention, float]] = {}
-        if "gather" in names:
-            found["gather + segment softmax"] = self.gather(), 1.0
-        if "flex" in names:
-            found["FlexAttention"] = self.flex(), 1.0
-        for attend, _ in found.values():
-            close = torch.isclose(attend(*self.tensors).float(), out, **tolerance)
+        for name, make in (makers[name] for name in names if name in makers):
+            try:
+                attend = make()
+                close = torch.isclose(attend(*self.tensors).float(), out, **tolerance)
+            except RuntimeError as error:
+                print(f"  {name}: does not run here ({str(error).splitlines()[0]})")
+                continue
             # FlexAttention tests rays in float32: a pair in a million is another one.
-            assert close.all(dim=-1).all(dim=-1).float().mean() > 0.99
+            assert close.flatten(1).all(dim=1).float().mean() > 0.99
+            found[name] = attend, 1.0
         if "dense" in names:
             attend, some, met = self.dense(share)
             torch.testing.assert_close(attend(*self.tensors)[met].float(), out[some][met], **tolerance)

@@ -8,6 +8,8 @@ least bytes at the speed of a large copy, both measured first. Losses and optimi
 from __future__ import annotations
 
 import argparse
+import time
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from functools import partial
 from typing import Any
@@ -31,6 +33,9 @@ from raytran.run.forecast import Load, work_of_parts
 from raytran.run.step_parts import Part, step_parts
 from raytran.types import ObjectSet, SceneBatch, Views
 
+Clock = Callable[[], float] | None
+"""Seconds; None is the wall clock, which waits for a GPU."""
+
 
 def main() -> None:
     """Measure and print the parts, slowest first, and the whole step."""
@@ -43,9 +48,15 @@ def main() -> None:
     parser.add_argument(
         "--ceilings", type=float, nargs=2, metavar=("TFLOP/S", "GB/S"), help="of another machine, for --count"
     )
+    parser.add_argument(
+        "--cpu-time", action="store_true", help="this process's own time, one thread: for a busy machine"
+    )
     parser.add_argument("settings", nargs="*", help="more settings of conf/train.yaml, key=value")
     arguments = parser.parse_args()
     torch.manual_seed(0)
+    clock = time.process_time if arguments.cpu_time else None
+    if arguments.cpu_time:
+        torch.set_num_threads(1)
     settings = [f"preset={arguments.preset}", "experiment=stage2", "output_dir=unused", *arguments.settings]
     cfg = compose("train", [*settings, "model.backbone.resnet.weights=null"])
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -56,17 +67,18 @@ def main() -> None:
     print_machine()
     rows = []
     if not arguments.whole:
-        ceilings = measure_ceilings(device, _dtype(device))
+        ceilings = measure_ceilings(device, _dtype(device), clock or time.perf_counter)
         if arguments.ceilings:
             ceilings = Ceilings(1e12 * arguments.ceilings[0], 1e9 * arguments.ceilings[1])
         rows, parts = count_parts(model, batch.views, ceilings, half=bool(arguments.ceilings))
         if not arguments.count:
-            measure_parts(rows, parts, arguments.rounds, device)
+            measure_parts(rows, parts, arguments.rounds, device, clock)
         print_parts(rows)
     if not arguments.count:
-        rows.append(measure_step(cfg, model, batch, arguments.rounds, device))
+        rows.append(measure_step(cfg, model, batch, arguments.rounds, device, clock))
     if arguments.output:
         about = {"preset": arguments.preset, "views": count, "settings": " ".join(arguments.settings)}
+        about["clock"] = "process" if arguments.cpu_time else "wall"
         write_rows(arguments.output / f"step-{arguments.preset}.csv", [about | row for row in rows])
 
 
@@ -127,11 +139,13 @@ def count_parts(
     return rows, parts
 
 
-def measure_parts(rows: list[dict[str, Any]], parts: list[Part], rounds: int, device: torch.device) -> None:
+def measure_parts(
+    rows: list[dict[str, Any]], parts: list[Part], rounds: int, device: torch.device, clock: Clock
+) -> None:
     """Enter into each row what its part takes."""
     runs = {part.name: partial(train_part, part, device) for part in parts}
     peaks = {name: peak_mebibytes(run) for name, run in runs.items()}
-    seconds = median_seconds(runs, rounds)
+    seconds = median_seconds(runs, rounds, clock)
     for row, part in zip(rows, parts, strict=True):
         row |= {"seconds": part.times * seconds[part.name], "peak_mib": peaks[part.name]}
 
@@ -162,7 +176,7 @@ def train_part(part: Part, device: torch.device) -> None:
 
 
 def measure_step(
-    cfg: Any, model: RayTran, batch: SceneBatch, rounds: int, device: torch.device
+    cfg: Any, model: RayTran, batch: SceneBatch, rounds: int, device: torch.device, clock: Clock
 ) -> dict[str, Any]:
     """Return and print time and memory of the whole step of stage 2, optimiser included."""
     stage, loss = instantiate(cfg.stage, _convert_="all"), instantiate(cfg.loss, _convert_="all")
@@ -185,7 +199,7 @@ def measure_step(
         scaler.update()
 
     step()
-    seconds, peak = median_seconds({"step": step}, rounds)["step"], peak_mebibytes(step)
+    seconds, peak = median_seconds({"step": step}, rounds, clock)["step"], peak_mebibytes(step)
     print(
         f"{'whole step':32s} {1e3 * seconds:10.1f} ms, {1 / seconds:.2f} steps/s, {peak:.0f} MiB over weights"
     )

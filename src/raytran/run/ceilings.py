@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,44 +23,38 @@ class Ceilings:
     bytes_per_second: float
 
 
-def measure_ceilings(device: torch.device, dtype: torch.dtype = torch.float32) -> Ceilings:
+def measure_ceilings(
+    device: torch.device,
+    dtype: torch.dtype = torch.float32,
+    clock: Callable[[], float] = time.perf_counter,
+) -> Ceilings:
     """Measure both ceilings; takes about a second.
 
     Args:
         device: what to measure.
         dtype: of the matrix product.
+        clock: seconds; that of the process on a CPU that others use too, with one thread.
     """
     side = 8192 if device.type == "cuda" else 1536
     length = 1 << (28 if device.type == "cuda" else 25)
     a, b = (torch.randn(side, side, device=device).to(dtype) for _ in range(2))
     source, target = (torch.zeros(length, device=device) for _ in range(2))
     return Ceilings(
-        2 * side**3 / best_seconds(lambda: a @ b, device),
-        2 * 4 * length / best_seconds(lambda: target.copy_(source), device),
+        2 * side**3 / _best_seconds(lambda: a @ b, device, clock),
+        2 * 4 * length / _best_seconds(lambda: target.copy_(source), device, clock),
     )
 
 
-def best_seconds(run: Callable[[], object], device: torch.device, rounds: int = 5) -> float:
-    """Return the shortest of some runs after one to warm up: what other work slows down is no ceiling."""
-    return min(time_rounds(run, device, rounds))
-
-
-def median_seconds(run: Callable[[], object], device: torch.device, rounds: int = 5) -> float:
-    """Return the median of some runs after one to warm up."""
-    return statistics.median(time_rounds(run, device, rounds))
-
-
-def time_rounds(run: Callable[[], object], device: torch.device, rounds: int) -> list[float]:
-    """Return the seconds of each run after one to warm up; a GPU's work is waited for."""
+def _best_seconds(run: Callable[[], object], device: torch.device, clock: Callable[[], float]) -> float:
+    """Return the shortest of five runs after one to warm up: what other work slows down is no ceiling."""
     seconds = []
-    for number in range(rounds + 1):
+    for _ in range(6):
         _wait(device)
-        start = time.perf_counter()
+        start = clock()
         run()
         _wait(device)
-        if number:
-            seconds.append(time.perf_counter() - start)
-    return seconds
+        seconds.append(clock() - start)
+    return min(seconds[1:])
 
 
 def _wait(device: torch.device) -> None:
