@@ -53,7 +53,7 @@ def test_advice_names_the_first_setting_that_fits() -> None:
     assert "12.0 GB even with checkpoint_blocks=true" in advice([plain, again], 8 * GIBIBYTE)
 
 
-def test_a_plan(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_plan(caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]) -> None:
     with caplog.at_level(logging.INFO):
         grid, views = "model.grid.resolution=[12,12,6]", ["data.views=24", "views.image_size=[192,256]"]
         needs = plan(compose("plan", [*FAST, "gpu=16GB", grid, *views]))
@@ -65,6 +65,7 @@ def test_a_plan(caplog: pytest.LogCaptureFixture) -> None:
     assert predict["views_at_once=4"].memory < predict["views_at_once=null"].memory
     assert train[0].seconds > predict["views_at_once=null"].seconds > 0
     assert "predict: 24 frames fit with views_at_once=16" in caplog.text
+    assert "training in 16-mixed" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_plan_from_the_cameras_of_a_scan(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -78,7 +79,7 @@ def test_a_plan_from_the_cameras_of_a_scan(tmp_path: Path, caplog: pytest.LogCap
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("precision=8", "choose one of 16-mixed"),
+        ("precision=8", "one of 16-mixed"),
         ("gpu=big", "gpu=16GB"),
         ("ceilings=[0,1]", r"ceilings=\[100,900\]"),
         ("views.image_size=[90,128]", "divisible by 16"),

@@ -68,9 +68,10 @@ def plan(cfg: DictConfig) -> list[Need]:
         ConfigError: a setting has no meaning.
         DataError: the scene's folder is missing or damaged.
     """
-    if cfg.precision not in PRECISIONS:
-        raise ConfigError(f"unknown precision={cfg.precision}: choose one of {', '.join(PRECISIONS)}")
     device, limit = _device(cfg.gpu)
+    precision = ("16-mixed" if device == "gpu" else "32-true") if cfg.precision == "auto" else cfg.precision
+    if precision not in PRECISIONS:
+        raise ConfigError(f"unknown precision={precision}: choose auto or one of {', '.join(PRECISIONS)}")
     model, stage = _model(cfg), instantiate(cfg.stage, _convert_="all")
     train_views = cfg.data.views or cfg.views.num_views
     predict_views = cfg.data.views or cfg.views.predict_views
@@ -88,9 +89,9 @@ def plan(cfg: DictConfig) -> list[Need]:
         f"{_pairs(one):,}",
     )
     ceilings = _ceilings(cfg)
-    needs = _training(model, load, stage, cfg.precision, ceilings)
+    needs = _training(model, load, stage, precision, ceilings)
     needs += _prediction(model, one, cfg.views_at_once, ceilings)
-    Console().print(_table(needs, limit, ceilings, cfg.precision))
+    Console().print(_table(needs, limit, ceilings, precision))
     for job in ("train", "predict"):
         _log.info("%s", advice([need for need in needs if need.job == job], limit))
     return needs

@@ -19,10 +19,10 @@ from raytran.backbone.block import RayTracedBlock, Stream
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.model import TASKS, RayTran
+from raytran.ops.block_pairs import BlockPairs
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_attention import ray_attention
 from raytran.ops.splat import splat_features
-from raytran.ops.traverse import trace_pairs
 from raytran.types import Views
 
 
@@ -45,7 +45,7 @@ class Part:
 
 
 def step_parts(
-    model: RayTran, views: Views, pairs: PairList, *, tasks: Collection[str] = TASKS
+    model: RayTran, views: Views, pairs: PairList | BlockPairs, *, tasks: Collection[str] = TASKS
 ) -> list[Part]:
     """Return the parts of a training step up to the heads, in the order in which they run.
 
@@ -73,7 +73,7 @@ def step_parts(
     pixels = features(scenes * count, height, width, backbone.channels)
 
     def trace() -> None:
-        trace_pairs(cameras, grid, (height, width), model.rays_per_cell)
+        model.ray_tracer(cameras, grid, (height, width), model.rays_per_cell)
 
     blocks, to_pixels = len(backbone.blocks), len(backbone.blocks) - (not with_pixels)
     parts = [
@@ -97,7 +97,7 @@ def _stream_parts(
     stream: Stream,
     target: Tensor,
     source: Tensor,
-    pairs: PairList,
+    pairs: PairList | BlockPairs,
 ) -> list[Part]:
     """Return the parts of one direction of a block."""
     query, key, value = (
