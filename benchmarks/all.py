@@ -56,7 +56,7 @@ def commands(*, gpu: bool, quick: bool) -> list[list[str]]:
         [*attention, *one_size, "--baselines", *baselines, "--name", "attention"],
         ["traversal.py", "--views", *views],
         *(["step.py", "--preset", preset] for preset in presets),
-        [*attention, "--views", *views, *against, "--name", "attention-views"],
+        [*attention, "--views", *views, *one_size[2:], *against, "--name", "attention-views"],
         [
             *attention,
             "--views",

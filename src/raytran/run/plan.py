@@ -110,7 +110,7 @@ def parse_size(text: str) -> int:
 
 
 def advice(needs: list[Need], limit: int) -> str:
-    """Return one sentence: what fits, what makes it fit, or how many frames would.
+    """Return one sentence: what fits, what makes it fit, or what else could be changed.
 
     Args:
         needs: the ways to do one job, in the order of preference.
