@@ -11,7 +11,7 @@ from raytran.backbone.resnet import ResNet18
 from raytran.heads.foreground import ForegroundHead
 from raytran.heads.occupancy import OccupancyHead
 from raytran.model import RayTran
-from raytran.ops import ray_tracer
+from raytran.ops import block_pairs, ray_tracer
 from raytran.ops.block_pairs import BlockPairs
 from raytran.types import RawScene, Views
 
@@ -47,6 +47,12 @@ def _views() -> Views:
     intrinsics = torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]).expand(1, 2, 3, 3)
     images = torch.rand(1, 2, 3, 32, 48, generator=torch.Generator().manual_seed(1))
     return Views(images, intrinsics, pose)
+
+
+@pytest.fixture(autouse=True)
+def few_slots(monkeypatch):
+    """The interpreter takes its time over every program, also of a slot that is not used."""
+    monkeypatch.setattr(block_pairs, "_SLOTS", 16)
 
 
 def _loss(raw: RawScene) -> torch.Tensor:

@@ -7,8 +7,8 @@ slowly. The operator takes and gives tensors alone and knows its shapes without 
 that comes in and sums in float32.
 
 Beyond inputs and outputs it needs the log-sum-exp of each target and head, going backward one more number of
-the kind, and scratch memory that is bounded whatever the number of views: 256 rows of 64 voxels at most, with
-8 heads of 32 channels 17 MB forward and 34 MB backward.
+the kind, and scratch memory of one size whatever the number of views: 512 rows of 32, with 8 heads of 32
+channels 17 MB forward and 34 MB backward.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from raytran.ops.block_pairs import BlockOrder, BlockPairs, Tiling
+from raytran.ops.block_pairs import BlockOrder, BlockPairs
+from raytran.ops.tiling import ROW, Tiling
 from raytran.ops.triton_attention import attend_forward, merge_forward
 from raytran.ops.triton_attention_backward import (
     attend_backward_sources,
@@ -65,7 +66,6 @@ def block_attention(
         blocks.masks,
         tensors_of(by_target),
         tensors_of(by_source),
-        [by_target.num_slots, by_source.num_slots],
         layout_of(targets),
         layout_of(sources),
     )
@@ -73,12 +73,12 @@ def block_attention(
 
 def tensors_of(order: BlockOrder) -> list[Tensor]:
     """Return an order as an operator takes it."""
-    return [order.source_start, order.place, order.items, order.merges]
+    return [order.part_start, order.place, order.items, order.merges]
 
 
 def layout_of(tiling: Tiling) -> list[int]:
-    """Return the sizes of a grid and of its boxes as an operator takes them."""
-    return [*tiling.shape[1:], *tiling.tile]
+    """Return the sizes of a grid, its boxes and their parts as an operator takes them."""
+    return [*tiling.shape[1:], *tiling.tile, *tiling.part]
 
 
 @torch.library.custom_op("raytran::block_attention", mutates_args=())
@@ -89,13 +89,12 @@ def _attend(
     masks: Tensor,
     by_target: Sequence[Tensor],
     by_source: Sequence[Tensor],
-    num_slots: Sequence[int],
     targets: Sequence[int],
     sources: Sequence[int],
 ) -> tuple[Tensor, Tensor]:
     """Return the result ``(T, H, D)`` and the log-sum-exp ``(T, H)`` float32, as ``block_attention`` does."""
     query, key, value = query.contiguous(), key.contiguous(), value.contiguous()
-    launch = Launch(query, key, by_target, num_slots[0], targets, sources)
+    launch = Launch(query, key, by_target, targets, sources)
     outputs = torch.empty_like(query), query.new_empty(query.shape[:2], dtype=torch.float32)
     parts = launch.scratch(query.shape[2]), launch.scratch(1)
     with torch.cuda.device_of(query):
@@ -111,7 +110,6 @@ def _attend_backward(
     masks: Tensor,
     by_target: Sequence[Tensor],
     by_source: Sequence[Tensor],
-    num_slots: Sequence[int],
     targets: Sequence[int],
     sources: Sequence[int],
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -121,13 +119,14 @@ def _attend_backward(
     d_query, d_key, d_value = torch.empty_like(query), torch.empty_like(key), torch.empty_like(value)
     delta = torch.empty_like(logsumexp)
     with torch.cuda.device_of(query):
-        launch = Launch(query, key, by_target, num_slots[0], targets, sources)
+        launch = Launch(query, key, by_target, targets, sources)
         part = launch.scratch(query.shape[2])
         _backward_targets[launch.grid](
             inputs, logsumexp, (d_query, delta), part, *launch.arguments(masks, query.dtype)
         )
         launch.merge(merge_sums, d_query, part)
-        launch = Launch(key, query, by_source, num_slots[1], sources, targets)
+        del part
+        launch = Launch(key, query, by_source, sources, targets)
         parts = launch.scratch(query.shape[2]), launch.scratch(query.shape[2])
         _backward_sources[launch.grid](
             inputs, (logsumexp, delta), (d_key, d_value), parts, *launch.arguments(masks, query.dtype)
@@ -144,8 +143,7 @@ class Launch:
         row: ``(R, H, D)`` a tensor of the rows' side, targets or sources.
         other: ``(J, H, D)`` one of the other side.
         order: tensors of the ``BlockOrder`` of the rows.
-        num_slots: its slots of scratch memory.
-        rows: layout of the rows' grid: sizes and tile.
+        rows: layout of the rows' grid.
         others: layout of the other grid.
     """
 
@@ -154,13 +152,13 @@ class Launch:
         row: Tensor,
         other: Tensor,
         order: Sequence[Tensor],
-        num_slots: int,
         rows: Sequence[int],
         others: Sequence[int],
     ) -> None:
-        self._row, self._order, self._num_slots = row, order, num_slots
+        self._row, self._order = row, order
         _, self._heads, self._dim = row.shape
-        self._shape, self._tile, other_tile = tuple(rows[:3]), tuple(rows[3:]), tuple(others[3:])
+        self._shape = tuple(rows[:3])
+        self._tile, other_tile = ((tuple(side[3:6]), tuple(side[6:])) for side in (rows, others))
         self._width = max(16, triton.next_power_of_2(self._dim))
         self._sizes = self._shape, tuple(others[:3]), row.shape[0], other.shape[0], self._heads
         self._constants = (self._tile, other_tile), self._dim, self._width
@@ -168,8 +166,9 @@ class Launch:
 
     def scratch(self, width: int) -> Tensor:
         """Return memory for the pieces of long rows."""
-        slots = self._tile[0] * self._tile[1] * self._tile[2] * self._num_slots
-        return self._row.new_empty(slots * self._heads * width, dtype=torch.float32)
+        return self._row.new_empty(
+            2 * self._order[3].shape[0] * ROW * self._heads * width, dtype=torch.float32
+        )
 
     def arguments(self, masks: Tensor, dtype: torch.dtype) -> tuple[Any, ...]:
         """Return the kernels' arguments from ``order`` on, for inputs of a dtype."""
@@ -207,7 +206,7 @@ def _keep(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> N
 def _gradients(ctx: Any, grad: Tensor, _: Tensor) -> tuple[Any, ...]:
     saved = list(ctx.saved_tensors)
     gradients = _attend_backward(grad, saved[:5], saved[5], saved[6:10], saved[10:], *ctx.layout)
-    return *gradients, None, [None] * 4, [None] * 4, None, None, None
+    return *gradients, None, [None] * 4, [None] * 4, None, None
 
 
 _attend.register_autograd(_gradients, setup_context=_keep)

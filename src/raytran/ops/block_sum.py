@@ -16,10 +16,10 @@ from raytran.ops.block_attention import Launch, layout_of, tensors_of
 from raytran.ops.block_pairs import BlockPairs
 from raytran.ops.triton_attention import (
     box_inside,
-    box_mask,
     box_offsets,
-    channel_places,
-    load_box,
+    load_elements,
+    load_parts,
+    part_offsets,
     store_sum,
 )
 from raytran.ops.triton_attention_backward import merge_sums
@@ -36,7 +36,6 @@ def block_sum(features: Tensor, blocks: BlockPairs) -> Tensor:
         blocks.masks,
         tensors_of(by_voxel),
         tensors_of(by_pixel),
-        [by_voxel.num_slots, by_pixel.num_slots],
         layout_of(blocks.voxels),
         layout_of(blocks.pixels),
         blocks.num_voxels,
@@ -49,7 +48,6 @@ def _sum(
     masks: Tensor,
     by_target: Sequence[Tensor],
     by_source: Sequence[Tensor],
-    num_slots: Sequence[int],
     targets: Sequence[int],
     sources: Sequence[int],
     num_targets: int,
@@ -60,7 +58,7 @@ def _sum(
     width = gcd(channels, 64) if channels % 16 == 0 else channels
     grouped = source.contiguous().view(source.shape[0], -1, width)
     out = source.new_empty((num_targets, *grouped.shape[1:]), dtype=torch.float32)
-    launch = Launch(out, grouped, by_target, num_slots[0], targets, sources)
+    launch = Launch(out, grouped, by_target, targets, sources)
     part = launch.scratch(width)
     with torch.cuda.device_of(source):
         sum_boxes[launch.grid](grouped, out, part, *launch.arguments(masks, grouped.dtype))
@@ -81,25 +79,19 @@ def sum_boxes(
     OPERAND: tl.constexpr,
 ) -> None:
     """Sum over each target of a row the sources it is joined with, for one group of channels."""
-    ROWS: tl.constexpr = TILES[0][0] * TILES[0][1] * TILES[0][2]
     heads = sizes[4]
     item_ptr, head = order[2] + tl.program_id(0) // heads * 4, tl.program_id(0) % heads
-    start, slot = tl.load(item_ptr), tl.load(item_ptr + 3)
+    start, last, slot = tl.load(item_ptr), tl.load(item_ptr + 2), tl.load(item_ptr + 3)
     if start < 0:
         return
-    is_channel = tl.arange(0, WIDTH)[None, :] < DIM
-    others = box_offsets(sizes[1], TILES[1])
-    other_places = channel_places(others, head, heads, DIM, WIDTH)
-    summed = tl.zeros((ROWS, WIDTH), tl.float32)
-    for pair in range(tl.load(item_ptr + 1), tl.load(item_ptr + 2)):
-        source = tl.load(order[0] + pair)
-        exists = (source + others < sizes[3])[:, None] & is_channel
-        feature = load_box(source_ptr, source, other_places, exists, heads * DIM, OPERAND)
-        joined = box_mask(order[3], tl.load(order[1] + pair), ROWS == 64).to(OPERAND)
-        summed = tl.dot(joined, feature, summed, input_precision="ieee")
-    places = channel_places(box_offsets(sizes[0], TILES[0]), head, heads, DIM, WIDTH)
-    there = box_inside(start, sizes[0], TILES[0])[:, None] & is_channel
-    store_sum(out_ptr, part_ptr, summed, start, places, there, slot, head, heads, DIM)
+    offsets = part_offsets(sizes[1], TILES[1])
+    summed = tl.zeros((32, WIDTH), tl.float32)
+    for first in range(tl.load(item_ptr + 1), last, 8):
+        source, exists, joined = load_parts(order, first, last, offsets, sizes[3])
+        feature = load_elements(source_ptr, source, exists, head, heads, DIM, WIDTH, OPERAND)
+        summed = tl.dot(joined.to(OPERAND), feature, summed, input_precision="ieee")
+    target, inside = start + box_offsets(sizes[0], TILES[0]), box_inside(start, sizes[0], TILES[0])
+    store_sum(out_ptr, part_ptr, summed, target, inside, slot, head, heads, DIM)
 
 
 @_sum.register_fake
@@ -115,9 +107,9 @@ def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
 
 def _gradients(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
     masks, *orders = ctx.saved_tensors
-    (number, dtype), (slots, targets, sources, _) = ctx.source, ctx.layout
-    back = _sum(grad, masks, orders[4:], orders[:4], slots[::-1], sources, targets, number)
-    return back.to(dtype), None, [None] * 4, [None] * 4, None, None, None, None
+    (number, dtype), (targets, sources, _) = ctx.source, ctx.layout
+    back = _sum(grad, masks, orders[4:], orders[:4], sources, targets, number)
+    return back.to(dtype), None, [None] * 4, [None] * 4, None, None, None
 
 
 _sum.register_autograd(_gradients, setup_context=_keep)

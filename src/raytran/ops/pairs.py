@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from raytran.errors import ShapeError, check_shape
-from raytran.ops.block_pairs import BlockPairs, Tiling, kept
+from raytran.ops.block_pairs import BlockPairs, kept
+from raytran.ops.tiling import Tiling
 from raytran.types import Parcel
 
 Side = Literal["pixels", "voxels"]

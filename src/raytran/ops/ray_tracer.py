@@ -11,9 +11,10 @@ from torch import Tensor
 
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.ops.block_pairs import BlockPairs, Tiling
+from raytran.ops.block_pairs import BlockPairs
 from raytran.ops.fused import has_kernels
 from raytran.ops.pairs import PairList
+from raytran.ops.tiling import Tiling
 from raytran.ops.traverse import trace_pairs
 
 _log = logging.getLogger(__name__)

@@ -3,11 +3,11 @@
 
 It finds the same pairs as ``trace_pairs`` but never lists them. First every ray is tested against every
 block of voxels, then the rays of each tile that touches a block against its voxels. At the paper's size that
-is 59 million slab tests of blocks and, with 12,500 block pairs, 103 million of voxels. At 80 and 72
-instructions each, counted in the code for an H200, they are 378 million instructions of a warp, 0.4 ms if all
-its schedulers are busy; the bytes (3 MB of rays, 3 MB of masks, 0.5 MB of marks) take less than 10 µs, and
-some hundred small launches for the rays and the orders 0.5 ms. Reckoned, not measured. Work grows linearly
-with views.
+is 118 million slab tests of blocks and, with 19,100 block pairs, 78 million of voxels. At 80 and 75
+instructions each, counted in the code for an H200, they are 480 million instructions of a warp, 0.5 ms if all
+its schedulers are busy; the bytes (3 MB of rays, 5 MB of masks, 1 MB of marks) take less than 10 µs, and some
+hundred small launches for the rays and the orders 0.5 ms. Reckoned, not measured. Work grows linearly with
+views.
 
 How many block pairs there are only the GPU knows; ``ray_tracer`` says how the host need not wait to hear it.
 """
@@ -20,7 +20,8 @@ from torch import Tensor
 
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.ops.block_pairs import VOXELS, BlockPairs, Tiling
+from raytran.ops.block_pairs import BlockPairs
+from raytran.ops.tiling import ROW, Tiling
 from raytran.ops.traverse import NUDGE, voxel_rays
 from raytran.ops.triton_traverse import list_blocks, mask_blocks, touch_blocks
 
@@ -77,15 +78,16 @@ def _trace(
     blocks_of_scene, device = blocks // scenes, rays[1].device
     touched = torch.empty(tiles, blocks_of_scene, dtype=torch.int8, device=device)
     grid = tiles, triton.cdiv(blocks_of_scene, _BLOCKS_AT_ONCE)
-    touch_blocks[grid](*rays, touched, sizes, pixels.tile, rays_per_pixel, _BLOCKS_AT_ONCE, NUDGE)
+    boxes = (pixels.tile, pixels.part), (voxels.tile, voxels.part)
+    touch_blocks[grid](*rays, touched, sizes, *boxes, rays_per_pixel, _BLOCKS_AT_ONCE, NUDGE)
     last = touched.sum(dim=1, dtype=torch.int64).cumsum(0)
     first = torch.nn.functional.pad(last[:-1], (1, 0))
     capacity = int(last[-1]) if capacity is None else capacity
     keys = torch.full((capacity,), tiles * blocks, dtype=torch.int64, device=device)
-    masks = torch.empty(capacity, VOXELS, dtype=torch.int32, device=device)
+    masks = torch.empty(capacity, 2, ROW, dtype=torch.int32, device=device)
     if capacity:
         list_blocks[tiles,](
             touched, first, keys, capacity, blocks_of_scene, tiles // scenes, blocks, _BLOCKS_AT_ONCE
         )
-        mask_blocks[capacity,](*rays, keys, masks, sizes, tiles, blocks, pixels.tile, rays_per_pixel, NUDGE)
+        mask_blocks[capacity,](*rays, keys, masks, sizes, tiles, blocks, *boxes, rays_per_pixel, NUDGE)
     return BlockPairs(keys, masks, pixels, voxels), last[-1]

@@ -16,7 +16,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from raytran.ops.triton_attention import box_inside, box_offsets
+from raytran.ops.triton_attention import box_cells, box_inside, box_offsets
 
 
 @triton.jit
@@ -54,12 +54,20 @@ def _crossed(
 
 
 @triton.jit
+def _block_cell(block: tl.tensor, counts: tl.tuple, BLOCK: tl.constexpr) -> tl.tuple:
+    """Return the first voxel of blocks of a scene, along the three axes."""
+    a, b = block // (counts[1] * counts[2]), block // counts[2] % counts[1]
+    return a * BLOCK[0][0], b * BLOCK[0][1], block % counts[2] * BLOCK[0][2]
+
+
+@triton.jit
 def touch_blocks(
     rays: tl.tuple,
     starts_ptr: tl.tensor,
     touched_ptr: tl.tensor,
     sizes: tl.tuple,
     TILE: tl.constexpr,
+    BLOCK: tl.constexpr,
     RAYS: tl.constexpr,
     BLOCKS: tl.constexpr,
     NUDGE: tl.constexpr,
@@ -68,11 +76,11 @@ def touch_blocks(
     tile, block = tl.program_id(0), tl.program_id(1) * BLOCKS + tl.arange(0, BLOCKS)
     start = tl.load(starts_ptr + tile)
     resolution, counts = sizes[1], sizes[2]
-    a, b, c = block // (counts[1] * counts[2]) * 4, block // counts[2] % counts[1] * 4, block % counts[2] * 4
+    a, b, c = _block_cell(block, counts, BLOCK)
     high = (
-        tl.minimum(a + 4, resolution[0]),
-        tl.minimum(b + 4, resolution[1]),
-        tl.minimum(c + 4, resolution[2]),
+        tl.minimum(a + BLOCK[0][0], resolution[0]),
+        tl.minimum(b + BLOCK[0][1], resolution[1]),
+        tl.minimum(c + BLOCK[0][2], resolution[2]),
     )
     touched = tl.zeros((BLOCKS,), tl.int32)
     for number in range(RAYS):
@@ -117,25 +125,27 @@ def mask_blocks(
     num_tiles: tl.tensor,
     all_blocks: tl.tensor,
     TILE: tl.constexpr,
+    BLOCK: tl.constexpr,
     RAYS: tl.constexpr,
     NUDGE: tl.constexpr,
 ) -> None:
-    """Write the mask of a block pair: which of its pixels' rays run through which of its voxels."""
-    pair, slot = tl.program_id(0), tl.arange(0, 64)
+    """Write the masks of a block pair: which of its pixels' rays run through which of its voxels."""
+    pair, slot = tl.program_id(0), tl.arange(0, 32)
     key = tl.load(keys_ptr + pair)
     tile = key // all_blocks
-    words = tl.zeros((64,), tl.int32)
+    crossed = tl.zeros((32, 32), tl.int32)
     if tile < num_tiles:
         start = tl.load(starts_ptr + tile)
         resolution, counts = sizes[1], sizes[2]
         block = (key % all_blocks % (counts[0] * counts[1] * counts[2])).to(tl.int32)
-        a = block // (counts[1] * counts[2]) * 4 + slot // 16
-        b = block // counts[2] % counts[1] * 4 + slot // 4 % 4
-        c = block % counts[2] * 4 + slot % 4
-        crossed = tl.zeros((32, 64), tl.int32)
+        first, cell = _block_cell(block, counts, BLOCK), box_cells(slot, BLOCK)
+        low = (first[0] + cell[0], first[1] + cell[1], first[2] + cell[2])
+        high = (low[0] + 1, low[1] + 1, low[2] + 1)
         for number in range(RAYS):
-            found = _crossed(rays, start, number, (a, b, c), (a + 1, b + 1, c + 1), sizes, TILE, RAYS, NUDGE)
+            found = _crossed(rays, start, number, low, high, sizes, TILE, RAYS, NUDGE)
             crossed = crossed | found.to(tl.int32)
-        words = tl.sum(crossed << tl.arange(0, 32)[:, None], axis=0)
-        words = tl.where((a < resolution[0]) & (b < resolution[1]) & (c < resolution[2]), words, 0)
-    tl.store(masks_ptr + pair.to(tl.int64) * 64 + slot, words)
+        inside = (low[0] < resolution[0]) & (low[1] < resolution[1]) & (low[2] < resolution[2])
+        crossed = tl.where(inside[None, :], crossed, 0)
+    mask_ptr = masks_ptr + pair.to(tl.int64) * 64 + slot
+    tl.store(mask_ptr, tl.sum(crossed << slot[:, None], axis=0))
+    tl.store(mask_ptr + 32, tl.sum(crossed << slot[None, :], axis=1))
