@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ray-traced attention against dense and gather-segment attention: ``python benchmarks/ray_attention.py``.
+"""Ray-traced attention against what one could put together: ``python benchmarks/ray_attention.py``.
 
-All in one run at the paper's size: 20 views of 30×40 pixels, 48×48×16 voxels, 8 heads of 32 channels. Dense
-attention is run on a slice of the targets, evenly spread, and its time scaled by their number: its work is
-the same for every target. ``--dense-share 1`` runs all of them.
+All in one run, on the GPU if there is one, at the paper's size: feature maps of 30×40 pixels, 48×48×16
+voxels, 8 heads of 32 channels. Dense attention is run on a slice of the targets, evenly spread, and its time
+scaled by their number: its work is the same for every target. ``--dense-share 1`` runs all of them.
 """
 
 from __future__ import annotations
@@ -11,18 +11,27 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
+from typing import Any
 
 import torch
-from camera_path import FEATURE_SIZE, paper_grid, recorded, walk
+from camera_path import FEATURE_SIZE, PAPER_GRID, add_arguments, cameras_of, paper_grid
+from flex import flex_ray_attention
+from record import write_rows
 from timing import median_seconds, peak_mebibytes, print_machine
 from torch import Tensor
 
+from raytran.geometry.camera import Cameras
+from raytran.geometry.grid import VoxelGrid
+from raytran.ops.fused import listed
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_attention import Direction, ray_attention
-from raytran.ops.traverse import trace_pairs
+from raytran.ops.ray_tracer import RayTracer
 
 HEADS, CHANNELS = 8, 32
+RAYS_PER_CELL = 2
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16, "float16": torch.float16}
+
+Attention = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 def dense_masked(query: Tensor, key: Tensor, value: Tensor, mask: Tensor) -> Tensor:
@@ -42,69 +51,168 @@ def gather_segment(query: Tensor, key: Tensor, value: Tensor, target: Tensor, so
     return torch.zeros_like(query).index_add(0, target, weight[..., None] * value[source])
 
 
-def _train(tensors: list[Tensor], pairs: PairList, direction: Direction) -> None:
+def train(attend: Attention, tensors: list[Tensor]) -> None:
+    """Run forward and backward."""
     inputs = [tensor.detach().requires_grad_() for tensor in tensors]
-    out = ray_attention(*inputs, pairs, direction)
+    out = attend(*inputs)
     torch.autograd.grad(out, inputs, torch.ones_like(out))
 
 
-def measure(pairs: PairList, direction: Direction, dense_share: float, rounds: int, backward: bool) -> None:
-    """Print the medians and ratios of one direction."""
-    sides = [(pairs.num_pixels, pairs.pixel_index), (pairs.num_voxels, pairs.voxel_index)]
-    (sources, source), (targets, target) = sides if direction == "pixels_to_voxels" else sides[::-1]
-    tensors = [torch.randn(n, HEADS, CHANNELS) for n in (targets, sources, sources)]
-    forward, both = (
-        partial(ray_attention, *tensors, pairs, direction),
-        partial(_train, tensors, pairs, direction),
-    )
-    print(f"{direction}: {peak_mebibytes(forward):.0f} MiB over the inputs for the forward pass,", end=" ")
-    print(f"{peak_mebibytes(both):.0f} MiB with the backward pass (results included)")
-    out = forward()
+class Case:
+    """One size and direction: the tensors, ours and the baselines.
 
-    some = torch.arange(0, targets, round(1 / dense_share))
-    mask = torch.zeros(len(some), sources, dtype=torch.bool)
-    place = torch.full((targets,), -1).index_copy(0, some, torch.arange(len(some)))[target]
-    mask[place[place >= 0], source[place >= 0]] = True
-    dense = dense_masked(tensors[0][some], *tensors[1:], mask)
-    met = mask.any(dim=1)
-    torch.testing.assert_close(out[some][met], dense[met], atol=1e-5, rtol=0)
-    torch.testing.assert_close(out, gather_segment(*tensors, target, source), atol=1e-5, rtol=0)
+    Args:
+        cameras: of N views.
+        grid: the volume.
+        direction: from the source to the target.
+        dtype: of the features.
+        device: where.
+    """
 
-    candidates: dict[str, Callable[[], object]] = {
-        "ray_attention": forward,
-        "gather + segment softmax": lambda: gather_segment(*tensors, target, source),
-        "dense masked SDPA": lambda: dense_masked(tensors[0][some], *tensors[1:], mask),
-    }
-    if backward:
-        candidates["ray_attention, with backward"] = both
-    seconds = median_seconds(candidates, rounds)
-    seconds["dense masked SDPA"] *= targets / len(some)
-    print(f"  dense: {len(some):,} of {targets:,} targets measured, time scaled")
-    for name, taken in seconds.items():
-        print(f"  {name:30s} {taken * 1e3:10.1f} ms  {taken / seconds['ray_attention']:7.1f}×")
+    def __init__(
+        self,
+        cameras: Cameras,
+        grid: VoxelGrid,
+        direction: Direction,
+        dtype: torch.dtype,
+        device: torch.device,
+    ) -> None:
+        self.cameras, self.grid, self.direction = cameras, grid, direction
+        self.pairs = RayTracer()(cameras, grid, FEATURE_SIZE, RAYS_PER_CELL)
+        self.listed: PairList = listed(self.pairs)
+        indices = self.listed.pixel_index, self.listed.voxel_index
+        counts = self.pairs.num_pixels, self.pairs.num_voxels
+        way = slice(None) if direction == "pixels_to_voxels" else slice(None, None, -1)
+        (self.source, self.target), (self.sources, self.targets) = indices[way], counts[way]
+        numbers = torch.Generator(device).manual_seed(0)
+        self.tensors = [
+            torch.randn(n, HEADS, CHANNELS, generator=numbers, device=device).to(dtype)
+            for n in (self.targets, self.sources, self.sources)
+        ]
+
+    def ours(self) -> Attention:
+        """Return the operator."""
+        return lambda query, key, value: ray_attention(query, key, value, self.pairs, self.direction)
+
+    def gather(self) -> Attention:
+        """Return gather, segment softmax and scatter."""
+        return lambda query, key, value: gather_segment(query, key, value, self.target, self.source)
+
+    def flex(self) -> Attention:
+        """Return FlexAttention."""
+        return flex_ray_attention(self.listed, self.cameras, self.grid, FEATURE_SIZE, self.direction)
+
+    def dense(self, share: float) -> tuple[Attention, Tensor, Tensor]:
+        """Return dense attention on some targets, which these are, and which of them have a pair."""
+        device = self.target.device
+        some = torch.arange(0, self.targets, round(1 / share), device=device)
+        mask = torch.zeros(len(some), self.sources, dtype=torch.bool, device=device)
+        number = torch.full((self.targets,), -1, device=device)
+        place = number.index_copy(0, some, torch.arange(len(some), device=device))[self.target]
+        mask[place[place >= 0], self.source[place >= 0]] = True
+        return (
+            (lambda query, key, value: dense_masked(query[some], key, value, mask)),
+            some,
+            mask.any(dim=1),
+        )
+
+    def baselines(self, names: list[str], share: float) -> dict[str, tuple[Attention, float]]:
+        """Return the baselines that run, each checked against ours, with its share of the work."""
+        makers = {
+            "gather": ("gather + segment softmax", self.gather),
+            "flex": ("FlexAttention", self.flex),
+        }
+        out = self.ours()(*self.tensors).float()
+        tolerance = {"atol": 1e-5 if self.tensors[0].dtype == torch.float32 else 3e-2, "rtol": 0}
+        found: dict[str, tuple[Attention, float]] = {}
+        for name, make in (makers[name] for name in names if name in makers):
+            try:
+                attend = make()
+                close = torch.isclose(attend(*self.tensors).float(), out, **tolerance)
+            except RuntimeError as error:
+                print(f"  {name}: does not run here ({str(error).splitlines()[0]})")
+                continue
+            # FlexAttention tests rays in float32: a pair in a million is another one.
+            assert close.flatten(1).all(dim=1).float().mean() > 0.99
+            found[name] = attend, 1.0
+        if "dense" in names:
+            attend, some, met = self.dense(share)
+            torch.testing.assert_close(attend(*self.tensors)[met].float(), out[some][met], **tolerance)
+            found["dense masked SDPA"] = attend, len(some) / self.targets
+        return found
+
+
+def measure(case: Case, names: list[str], share: float, rounds: int) -> list[dict[str, Any]]:
+    """Return and print the medians of one case, forward and with the backward pass."""
+    candidates = {"ray_attention": (case.ours(), 1.0), **case.baselines(names, share)}
+    rows = []
+    for job in ("forward", "forward + backward"):
+        runs, peaks = {}, {}
+        for name, (attend, _) in candidates.items():
+            if name == "dense masked SDPA" and job != "forward":
+                continue
+            run = partial(attend, *case.tensors) if job == "forward" else partial(train, attend, case.tensors)
+            try:
+                peaks[name] = peak_mebibytes(run)
+            except (RuntimeError, NotImplementedError) as error:
+                print(f"  {name}, {job}: does not run here ({str(error).splitlines()[0]})")
+                continue
+            runs[name] = run
+        seconds = median_seconds(runs, rounds)
+        for name, taken in seconds.items():
+            full = taken / candidates[name][1]
+            ratio = full / seconds["ray_attention"]
+            rows.append(
+                {
+                    "direction": case.direction,
+                    "views": len(case.cameras.intrinsics),
+                    "voxels": case.grid.num_voxels,
+                    "pairs": len(case.listed),
+                    "dtype": str(case.tensors[0].dtype).removeprefix("torch."),
+                    "job": job,
+                    "what": name,
+                    "seconds": full,
+                    "ratio": ratio,
+                    "peak_mib": peaks[name] if candidates[name][1] == 1 else "",
+                }
+            )
+            print(
+                f"  {job:18s} {name:26s} {full * 1e3:10.2f} ms {ratio:7.1f}×"
+                f"  {peaks[name]:7.0f} MiB over inputs"
+            )
+    return rows
 
 
 def main() -> None:
-    """Measure both directions."""
+    """Measure all cases."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scan", type=Path, help="a scan in ScanNet's layout; a made-up walk without it")
-    parser.add_argument("--views", type=int, default=20)
-    parser.add_argument("--rounds", type=int, default=5)
+    add_arguments(parser, rounds=5)
+    parser.add_argument("--views", type=int, nargs="+", default=[20])
+    parser.add_argument(
+        "--resolution", nargs="+", default=["x".join(map(str, PAPER_GRID))], help="e.g. 48x48x16"
+    )
+    parser.add_argument("--dtype", nargs="+", choices=tuple(DTYPES), default=["float32"])
+    parser.add_argument("--baselines", nargs="*", default=["gather", "dense"], help="gather, dense, flex")
     parser.add_argument(
         "--dense-share", type=float, default=1 / 16, help="share of the targets that dense runs on"
     )
-    parser.add_argument(
-        "--backward", action="store_true", help="also time ray_attention with its backward pass"
-    )
+    parser.add_argument("--name", default="ray_attention", help="of the CSV file")
     arguments = parser.parse_args()
-    torch.manual_seed(0)
-    cameras = recorded(arguments.scan, arguments.views) if arguments.scan else walk(arguments.views)
-    pairs = trace_pairs(cameras, paper_grid(cameras), FEATURE_SIZE)
-    pairs.by("voxels"), pairs.by("pixels")
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     print_machine()
-    print(f"{pairs.num_pixels:,} pixels × {pairs.num_voxels:,} voxels, {len(pairs):,} pairs")
-    for direction in ("voxels_to_pixels", "pixels_to_voxels"):
-        measure(pairs, direction, arguments.dense_share, arguments.rounds, arguments.backward)
+    rows = []
+    for views in arguments.views:
+        cameras = cameras_of(arguments, views, device)
+        for resolution in arguments.resolution:
+            x, y, z = (int(n) for n in resolution.split("x"))
+            for dtype in arguments.dtype:
+                for direction in ("voxels_to_pixels", "pixels_to_voxels"):
+                    case = Case(cameras, paper_grid(cameras, (x, y, z)), direction, DTYPES[dtype], device)
+                    size = f"{views} views, {resolution} voxels, {dtype}"
+                    print(f"{direction}, {size}: {len(case.listed):,} pairs")
+                    rows += measure(case, arguments.baselines, arguments.dense_share, arguments.rounds)
+    if arguments.output:
+        write_rows(arguments.output / f"{arguments.name}.csv", rows)
 
 
 if __name__ == "__main__":

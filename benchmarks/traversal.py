@@ -5,44 +5,52 @@ from __future__ import annotations
 
 import argparse
 from functools import partial
-from pathlib import Path
 
-from camera_path import FEATURE_SIZE, paper_grid, recorded, walk
+import torch
+from camera_path import FEATURE_SIZE, add_arguments, cameras_of, paper_grid
+from record import write_rows
 from timing import median_seconds, peak_mebibytes, print_machine
 
+from raytran.ops.fused import listed
 from raytran.ops.pairs import PairList
-from raytran.ops.traverse import trace_pairs
+from raytran.ops.ray_tracer import RayTracer
 
 
 def main() -> None:
-    """Measure tracing with one and with four rays a cell, and sorting by voxel."""
+    """Measure tracing with one and with four rays a cell; on a CPU, sorting by voxel too."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scan", type=Path, help="a scan in ScanNet's layout; a made-up walk without it")
-    parser.add_argument("--views", type=int, default=20)
-    parser.add_argument("--rounds", type=int, default=15)
+    add_arguments(parser, rounds=15)
+    parser.add_argument("--views", type=int, nargs="+", default=[20])
     arguments = parser.parse_args()
-    cameras = recorded(arguments.scan, arguments.views) if arguments.scan else walk(arguments.views)
-    grid = paper_grid(cameras)
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     print_machine()
+    rows = []
+    for views in arguments.views:
+        cameras = cameras_of(arguments, views, device)
+        grid = paper_grid(cameras)
+        # As in training: room for the pairs is known from the step before, and the host waits for nothing.
+        tracers = {
+            f"{n}×{n} rays a cell": partial(RayTracer(), cameras, grid, FEATURE_SIZE, n) for n in (1, 2)
+        }
+        pairs = {name: listed(trace()) for name, trace in tracers.items()}
+        found = pairs["2×2 rays a cell"]
 
-    one_ray, four_rays = (partial(trace_pairs, cameras, grid, FEATURE_SIZE, n) for n in (1, 2))
-    print(f"memory with 2×2 rays a cell, results included: {peak_mebibytes(four_rays):.0f} MiB")
-    pairs = four_rays()
-    print(f"{arguments.views} views: {len(one_ray()):,} pairs with one ray a cell, {len(pairs):,} with 2×2")
+        def sort_by_voxel(found: PairList = found) -> object:
+            return PairList(found.pixel_index, found.voxel_index, found.num_pixels, found.num_voxels).by(
+                "voxels"
+            )
 
-    def sort_by_voxel() -> object:
-        return PairList(pairs.pixel_index, pairs.voxel_index, pairs.num_pixels, pairs.num_voxels).by("voxels")
-
-    seconds = median_seconds(
-        {
-            "1 ray a cell": one_ray,
-            "2×2 rays a cell": four_rays,
-            "sorting 2×2 by voxel": sort_by_voxel,
-        },
-        arguments.rounds,
-    )
-    for name, taken in seconds.items():
-        print(f"{name:24s} {taken * 1e3:8.1f} ms")
+        candidates = (
+            dict(tracers) if device.type == "cuda" else {**tracers, "sorting 2×2 by voxel": sort_by_voxel}
+        )
+        peaks = {name: peak_mebibytes(run) for name, run in candidates.items()}
+        seconds = median_seconds(candidates, arguments.rounds)
+        for name, taken in seconds.items():
+            count, peak = len(pairs.get(name, found)), peaks[name]
+            rows.append({"views": views, "what": name, "pairs": count, "seconds": taken, "peak_mib": peak})
+            print(f"{views:4d} views  {name:24s} {count:11,} pairs {taken * 1e3:8.2f} ms  {peak:6.0f} MiB")
+    if arguments.output:
+        write_rows(arguments.output / "traversal.csv", rows)
 
 
 if __name__ == "__main__":

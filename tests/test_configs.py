@@ -148,9 +148,11 @@ def test_one_word_chooses_a_preset_and_typing_wins():
     assert config.data.num_views == 3
 
 
-@pytest.mark.parametrize("root", ["train", "curriculum", "evaluate", "prepare"])
+@pytest.mark.parametrize("root", ["train", "curriculum", "evaluate", "prepare", "plan"])
 def test_roots_resolve(root):
-    extra = {"evaluate": ["checkpoint=x.ckpt"], "prepare": ["output=x"]}.get(root, ["output_dir=x"])
+    extra = {"evaluate": ["checkpoint=x.ckpt"], "prepare": ["output=x"], "plan": []}.get(
+        root, ["output_dir=x"]
+    )
     OmegaConf.resolve(compose(root, ["preset=tiny", *extra]))
 
 

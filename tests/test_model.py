@@ -121,6 +121,29 @@ def test_the_world_may_be_moved() -> None:
     torch.testing.assert_close(shift, torch.tensor([8.0, -4.0, 2.0]).expand_as(shift), rtol=1e-3, atol=1e-3)
 
 
+def test_a_few_views_at_once_give_the_same_prediction() -> None:
+    model, views = make_model().eval(), make_views(views=5)
+    together, apart = model.predict(views), model.predict(views, views_at_once=2)
+    torch.testing.assert_close(together.occupancy, apart.occupancy, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(together.foreground, apart.foreground, rtol=1e-5, atol=1e-6)
+    assert together.objects.label.tolist() == apart.objects.label.tolist()
+    for name in ("center", "size", "score", "shape"):
+        together_, apart_ = getattr(together.objects, name), getattr(apart.objects, name)
+        torch.testing.assert_close(together_, apart_, rtol=1e-4, atol=1e-5)
+
+
+def test_frames_and_image_size_may_change_from_batch_to_batch() -> None:
+    model = make_model().eval()
+    first = model(make_views(views=2))
+    for views, scenes, size in ((1, 1, (16, 16)), (4, 2, (48, 32))):
+        cameras = make_views(scenes=scenes, views=views)
+        images = torch.zeros(scenes, views, 3, *size, dtype=torch.uint8)
+        raw = model(Views(images, cameras.intrinsics, cameras.world_from_camera))
+        assert raw.foreground.shape == (scenes, views, *size)
+        assert raw.occupancy.shape == (scenes, *RESOLUTION)
+    torch.testing.assert_close(model(make_views(views=2)).occupancy, first.occupancy)
+
+
 def test_bytes_equal_floats_and_masks_are_a_fourth_channel() -> None:
     model, views = make_model(input_channels=4).eval(), make_views(channels=4)
     as_float = Views(views.images / 255, views.intrinsics, views.world_from_camera)

@@ -14,11 +14,14 @@ import torch
 from torch import Tensor, nn
 
 from raytran.backbone.backbone import Backbone
+from raytran.backbone.chunked import run_in_chunks
 from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.heads.slots import objects_of_slots
-from raytran.ops.traverse import trace_pairs
+from raytran.ops.block_pairs import BlockPairs
+from raytran.ops.pairs import PairList
+from raytran.ops.ray_tracer import RayTracer
 from raytran.types import ObjectSet, RawScene, ScenePrediction, Views
 
 TASKS = ("occupancy", "foreground", "objects")
@@ -61,9 +64,15 @@ class RayTran(nn.Module):
         self.grid_resolution = (int(grid_resolution[0]), int(grid_resolution[1]), int(grid_resolution[2]))
         self.grid_extent = (float(grid_extent[0]), float(grid_extent[1]), float(grid_extent[2]))
         self.rays_per_cell = rays_per_cell
+        self.ray_tracer = RayTracer()
 
     def forward(
-        self, views: Views, *, tasks: Collection[str] = TASKS, grid_center: Tensor | None = None
+        self,
+        views: Views,
+        *,
+        tasks: Collection[str] = TASKS,
+        grid_center: Tensor | None = None,
+        views_at_once: int | None = None,
     ) -> RawScene:
         """Run the backbone once and the heads of ``tasks``.
 
@@ -71,30 +80,56 @@ class RayTran(nn.Module):
             views: posed images of B scenes.
             tasks: some of ``TASKS``.
             grid_center: ``(B, 3)`` centres of the voxel grids, metres; by default the mean camera position.
+            views_at_once: views that pass through the network together, so that memory hardly grows with
+                their number; for prediction only. None: all of them.
 
         Returns:
             Raw predictions, None for what was not asked for.
 
         Raises:
+            ConfigError: ``views_at_once`` is fewer than the views in training mode, or not positive.
             ShapeError: image sides are not divisible by the encoder's stride, or tensors do not have the
                 documented shapes.
         """
         cameras = Cameras(views.intrinsics, views.world_from_camera, views.image_size)
         center = cameras.position.mean(dim=1) if grid_center is None else grid_center
         grid = VoxelGrid(self.grid_resolution, self.grid_extent, center)
-        stride = self.backbone.stride
-        feature_size = (views.image_size[0] // stride, views.image_size[1] // stride)
-        pairs = trace_pairs(cameras, grid, feature_size, self.rays_per_cell)
-        with_pixels = "foreground" in tasks
-        voxels, pixels = self.backbone(views.images, cameras, grid, pairs, with_pixels=with_pixels)
+        voxels, pixels = self._lift(views.images, cameras, grid, "foreground" in tasks, views_at_once)
         objects, proposals = self.heads["objects"](voxels, grid) if "objects" in tasks else (None, None)
         return RawScene(
             grid_center=center,
             occupancy=self.heads["occupancy"](voxels) if "occupancy" in tasks else None,
-            foreground=self.heads["foreground"](pixels) if with_pixels else None,
+            foreground=None if pixels is None else self._foreground(pixels, views_at_once),
             objects=objects,
             proposals=proposals,
         )
+
+    def _lift(
+        self, images: Tensor, cameras: Cameras, grid: VoxelGrid, with_pixels: bool, views_at_once: int | None
+    ) -> tuple[Tensor, Tensor | None]:
+        """Run the backbone: voxel features, and pixel features if they are wanted."""
+
+        def trace(some: Cameras) -> PairList | BlockPairs:
+            stride = self.backbone.stride
+            size = (images.shape[-2] // stride, images.shape[-1] // stride)
+            return self.ray_tracer(some, grid, size, self.rays_per_cell)
+
+        if views_at_once is None or views_at_once >= images.shape[1]:
+            return self.backbone(images, cameras, grid, trace(cameras), with_pixels=with_pixels)
+        return run_in_chunks(
+            self.backbone,
+            images,
+            cameras,
+            grid,
+            trace,
+            views_at_once=views_at_once,
+            with_pixels=with_pixels,
+        )
+
+    def _foreground(self, pixels: Tensor, views_at_once: int | None) -> Tensor:
+        some = pixels.split(views_at_once or pixels.shape[1], dim=1)
+        logits = [self.heads["foreground"](chunk) for chunk in some]
+        return logits[0] if len(logits) == 1 else torch.cat(logits, dim=1)
 
     def decode_shapes(self, embedding: Tensor) -> Tensor:
         """Return shape logits ``(M, S, S, S)`` of query embeddings ``(M, C)``."""
@@ -112,7 +147,13 @@ class RayTran(nn.Module):
 
     @torch.no_grad()
     def predict(
-        self, views: Views, *, scene_id: str = "", score_threshold: float = 0.0, with_shapes: bool = True
+        self,
+        views: Views,
+        *,
+        scene_id: str = "",
+        score_threshold: float = 0.0,
+        with_shapes: bool = True,
+        views_at_once: int | None = None,
     ) -> ScenePrediction:
         """Predict one scene (B = 1). Puts the network in eval mode.
 
@@ -121,9 +162,11 @@ class RayTran(nn.Module):
             scene_id: name to give the result.
             score_threshold: slots with a lower score are left out.
             with_shapes: decode the objects' shapes.
+            views_at_once: views that pass through the network together, None for all; the same result up to
+                rounding in less memory.
         """
         self.eval()
-        raw = self(views)
+        raw = self(views, views_at_once=views_at_once)
         return self.decode(raw, [scene_id], score_threshold=score_threshold, with_shapes=with_shapes)[0]
 
     @torch.no_grad()

@@ -80,3 +80,25 @@ def test_without_pixels_the_voxels_are_the_same() -> None:
 def test_channels_must_split_into_heads() -> None:
     with pytest.raises(ConfigError, match="num_heads=3"):
         Backbone(resnet=ResNet18(width=4), channels=16, num_heads=3)
+
+
+def test_checkpointed_blocks_give_the_same_gradients_from_less_memory() -> None:
+    images, kept, gradients = torch.rand(1, 2, 3, 32, 32), [], []
+    for checkpoint_blocks in (False, True):
+        backbone = make_backbone(num_blocks=3).train()
+        backbone.checkpoint_blocks = checkpoint_blocks
+        saved: list[int] = []
+
+        def keep(tensor: torch.Tensor, saved: list[int] = saved) -> torch.Tensor:
+            saved.append(tensor.numel())
+            return tensor
+
+        with torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor):
+            voxels, pixels = backbone(images, **scene())
+        (voxels.square().sum() + pixels.square().sum()).backward()
+        kept.append(sum(saved))
+        gradients.append({name: parameter.grad for name, parameter in backbone.named_parameters()})
+    assert kept[1] < kept[0]
+    assert gradients[0].keys() == gradients[1].keys()
+    for name, gradient in gradients[0].items():
+        assert torch.equal(gradient, gradients[1][name]), name

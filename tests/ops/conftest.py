@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import pytest
 import torch
@@ -39,5 +41,18 @@ def random_cameras(generator: torch.Generator) -> Callable[..., Cameras]:
         pose[..., :3, 3] = spread * torch.randn(*lead, 3, generator=generator, dtype=torch.float64)
         intrinsics = torch.tensor([[50.0, 0.0, 41.0], [0.0, 47.0, 29.0], [0.0, 0.0, 1.0]])
         return Cameras(intrinsics.double().expand(*lead, 3, 3), pose, (60, 80))
+
+    return make
+
+
+@pytest.fixture
+def shaped_pairs(random_pairs: Callable[[int, int, float], PairList]) -> Callable[..., PairList]:
+    """Make pairs at random between views ``(n, h, w)`` and grids ``(B, X, Y, Z)``; the ends have none."""
+
+    def make(
+        pixel_shape: tuple[int, int, int], voxel_shape: tuple[int, int, int, int], density: float
+    ) -> PairList:
+        plain = random_pairs(math.prod(pixel_shape), math.prod(voxel_shape), density)
+        return replace(plain, pixel_shape=pixel_shape, voxel_shape=voxel_shape)
 
     return make

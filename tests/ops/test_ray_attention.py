@@ -4,11 +4,12 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor
+from torch._dynamo.testing import CompileCounterWithBackend
 
 from raytran.errors import ShapeError
-from raytran.ops import reference
+from raytran.ops import fused, pair_attention, reference
 from raytran.ops.pairs import PairList
-from raytran.ops.ray_attention import ray_attention
+from raytran.ops.ray_attention import ray_attention, ray_attention_with_sum
 
 DIRECTIONS = ("pixels_to_voxels", "voxels_to_pixels")
 both_directions = pytest.mark.parametrize("direction", DIRECTIONS)
@@ -132,18 +133,99 @@ def test_autocast_leaves_float32_input_exact(random_pairs, generator, direction)
             assert torch.equal(mine, theirs)
 
 
-def test_keeps_nothing_of_the_size_of_the_pairs_but_the_softmax_weights(random_pairs, generator):
+def test_keeps_nothing_of_the_size_of_the_pairs_but_their_exponentials(random_pairs, generator):
     pairs = random_pairs(40, 50, 0.5)
     inputs = _inputs(pairs, "pixels_to_voxels", 4, 3, generator)
     kept: list[Tensor] = []
     with torch.autograd.graph.saved_tensors_hooks(
         lambda tensor: kept.append(tensor) or tensor, lambda tensor: tensor
     ):
-        ray_attention(*inputs, pairs)
+        out = ray_attention(*inputs, pairs)
     known = {t.data_ptr() for order in (pairs.by("pixels"), pairs.by("voxels")) for t in order}
-    known |= {tensor.data_ptr() for tensor in inputs}
-    extra = [tensor for tensor in kept if tensor.data_ptr() not in known]
-    assert [tensor.numel() for tensor in extra] == [4 * len(pairs)]
+    known |= {tensor.data_ptr() for tensor in (*inputs, out)}
+    extra = [tensor.numel() for tensor in kept if tensor.data_ptr() not in known]
+    assert sorted(extra) == [4 * 50, 4 * len(pairs)]  # the sums of the softmax, and its exponentials
+
+
+@both_directions
+def test_sums_put_results_over_parts_of_the_sources_together(random_pairs, generator, direction):
+    pairs = random_pairs(12, 10, 0.6)
+    some = torch.arange(len(pairs)) % 3 == 0
+    parts = [PairList(pairs.pixel_index[mine], pairs.voxel_index[mine], 12, 10) for mine in (some, ~some)]
+    inputs = _inputs(pairs, direction, 2, 4, generator)
+    (one, weight_of_one), (other, weight_of_other) = (
+        ray_attention_with_sum(*inputs, part, direction) for part in parts
+    )
+    together = torch.logaddexp(weight_of_one, weight_of_other)
+    expected, weight = ray_attention_with_sum(*inputs, pairs, direction)
+    torch.testing.assert_close(together, weight)
+    assert (weight == -torch.inf).any()
+    shares = [(part - together).exp().nan_to_num()[..., None] for part in (weight_of_one, weight_of_other)]
+    torch.testing.assert_close(one * shares[0] + other * shares[1], expected)
+    assert not weight.requires_grad
+
+
+@both_directions
+def test_scores_far_apart_keep_their_precision(random_pairs, generator, direction):
+    # One target's scores are hundreds below another's: no shift of all could serve both.
+    pairs = random_pairs(12, 10, 0.6)
+    query, key, value = (tensor.detach() for tensor in _inputs(pairs, direction, 1, 4, generator))
+    query = query * torch.logspace(0, 3, len(query))[:, None, None]
+    exact = reference.ray_attention(query.double(), key.double(), value.double(), pairs, direction)
+    torch.testing.assert_close(
+        ray_attention(query, key, value, pairs, direction), exact.float(), atol=1e-3, rtol=0
+    )
+    assert torch.isfinite(exact).all()
+
+
+def test_operator_is_registered_as_torch_wants_it(random_pairs, generator):
+    pairs = random_pairs(5, 7, 0.5)
+    inputs = _inputs(pairs, "pixels_to_voxels", 2, 4, generator)
+    orders = [list(pairs.by(side)) for side in ("voxels", "pixels")]
+    torch.library.opcheck(pair_attention._attend, (*inputs, *orders))
+
+
+@both_directions
+def test_compile_and_export_pass_through(random_pairs, generator, direction):
+    pairs = random_pairs(9, 14, 0.4)
+    inputs = _inputs(pairs, direction, 2, 8, generator)
+
+    class Module(torch.nn.Module):
+        def forward(self, query: Tensor, key: Tensor, value: Tensor, pixel: Tensor, voxel: Tensor) -> Tensor:
+            return ray_attention(query, key, value, PairList(pixel, voxel, 9, 14), direction).relu()
+
+    index = pairs.pixel_index, pairs.voxel_index
+    expected = Module()(*inputs, *index)
+    gradients = torch.autograd.grad(expected.sum(), inputs)
+    compiled = torch.compile(Module(), fullgraph=True, backend="aot_eager")(*inputs, *index)
+    assert torch.equal(compiled, expected)
+    for mine, theirs in zip(torch.autograd.grad(compiled.sum(), inputs), gradients, strict=True):
+        assert torch.equal(mine, theirs)
+    exported = torch.export.export(Module(), (*(tensor.detach() for tensor in inputs), *index))
+    assert "raytran.pair_attention" in str(exported.graph)
+    assert torch.equal(exported.module()(*inputs, *index), expected)
+
+
+def test_another_number_of_pairs_needs_no_new_code(random_pairs, generator):
+    counter = CompileCounterWithBackend("aot_eager")
+    compiled = torch.compile(ray_attention, backend=counter, fullgraph=True)
+    for density in (0.3, 0.4, 0.5, 0.6):
+        pairs = random_pairs(9, 14, density)
+        pairs.by("pixels"), pairs.by("voxels")
+        inputs = _inputs(pairs, "pixels_to_voxels", 2, 8, generator)
+        assert torch.equal(compiled(*inputs, pairs), ray_attention(*inputs, pairs))
+    assert counter.frame_count <= 2  # one for the first size, one for all others
+
+
+def test_blocks_on_a_cpu_run_by_torch_sparse(random_pairs, generator, monkeypatch, caplog):
+    monkeypatch.setattr(fused, "_INTERPRETED", False)
+    fused._log_once.cache_clear()
+    pairs = random_pairs(9, 14, 0.4)
+    inputs = _inputs(pairs, "pixels_to_voxels", 2, 8, generator)
+    with caplog.at_level("DEBUG", logger="raytran"):
+        for _ in range(2):
+            assert torch.equal(ray_attention(*inputs, pairs.blocks()), ray_attention(*inputs, pairs))
+    assert [record.message.split(": ")[1] for record in caplog.records] == ["tensors are on the CPU"]
 
 
 def test_wrong_input(random_pairs, generator):

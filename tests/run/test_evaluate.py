@@ -29,7 +29,7 @@ class Oracle(nn.Module):
         self.objects = objects
         self.thresholds: list[float] = []
 
-    def forward(self, views, *, tasks, grid_center):
+    def forward(self, views, *, tasks, grid_center, views_at_once=None):
         assert set(tasks) == {"objects", "occupancy", "foreground"}
 
     def decode(self, raw, scene_ids, *, score_threshold=0.0, with_shapes=True):

@@ -34,8 +34,10 @@ class Oracle(nn.Module):
         self.weight = nn.Parameter(torch.zeros(1))
         self.seen: Views | None = None
 
-    def predict(self, views: Views, *, scene_id: str, score_threshold: float) -> ScenePrediction:
-        self.seen = views
+    def predict(
+        self, views: Views, *, scene_id: str, score_threshold: float, views_at_once: int | None
+    ) -> ScenePrediction:
+        self.seen, self.views_at_once = views, views_at_once
         center = torch.tensor([[0.5, 3.0, 0.5], [0.55, 3.0, 0.5], [-1.0, 3.0, 0.4]])
         objects = ObjectSet(
             label=torch.tensor([3, 3, 6]),
@@ -87,6 +89,7 @@ def config(folder, output, **changes) -> DictConfig:
         "score_threshold": 0.5,
         "duplicate_iou": 0.5,
         "num_overlays": 2,
+        "views_at_once": 4,
         "device": "cpu",
     }
     return OmegaConf.create(values | changes)
@@ -115,6 +118,7 @@ def test_views_follow_the_checkpoint_and_come_once(scene, oracle, tmp_path):
     module.predict(config(scene, tmp_path / "out"))
     # 96 views are asked for, four have a pose; frames shrink to the network's size, intrinsics with them.
     assert oracle.seen.images.shape == (1, 4, 3, *IMAGE_SIZE)
+    assert oracle.views_at_once == 4
     assert oracle.seen.intrinsics[0, 0, 0].tolist() == pytest.approx([70 * 0.8, 0, 32])
     assert oracle.seen.world_from_camera[0, :, 0, 3].tolist() == pytest.approx([0.0, 0.1, 0.3, 0.4])
     module.predict(config(scene, tmp_path / "out", num_views=2))

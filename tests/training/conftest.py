@@ -55,9 +55,9 @@ def batch(generator):
 def make_module():
     """Return a function that builds the LightningModule of an experiment."""
 
-    def make(experiment):
+    def make(experiment, *settings):
         torch.manual_seed(0)
-        cfg = compose("train", [*SMALL, f"experiment={experiment}"])
+        cfg = compose("train", [*SMALL, f"experiment={experiment}", *settings])
         return build_module(cfg, build_model(cfg))
 
     return make

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import lightning.pytorch as pl
 import pytest
@@ -57,3 +58,17 @@ def test_a_scene_without_objects_trains(experiment, batch, make_module):
     empty = replace(ObjectSet.empty(), shape=torch.zeros(0, 63, 63, 63, dtype=torch.bool))
     trainer = fit(make_module(experiment), replace(batch, objects=(empty,)), max_steps=1)
     assert torch.isfinite(trainer.logged_metrics["train/total"])
+
+
+@pytest.mark.slow
+def test_compiled_or_not_the_loss_and_the_names_of_the_weights_are_the_same(batch, make_module, monkeypatch):
+    """Without generated code, which needs a compiler: what is tested is what dynamo makes of the function."""
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
+    short = "model.backbone.num_blocks=1"
+    plain, compiled = make_module("stage1", short), make_module("stage1", short, "compile=true")
+    assert plain.state_dict().keys() == compiled.state_dict().keys()
+    few = {"max_steps": 1, "limit_val_batches": 0}
+    losses = [fit(module, batch, **few).logged_metrics["train/total"] for module in (plain, compiled)]
+    torch.testing.assert_close(losses[0], losses[1])
+    for name, weight in plain.state_dict().items():
+        torch.testing.assert_close(weight, compiled.state_dict()[name], msg=name)

@@ -7,6 +7,7 @@ from typing import Literal
 
 from torch import Tensor, nn
 
+from raytran.ops.block_pairs import BlockPairs
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_attention import Direction, ray_attention
 
@@ -35,7 +36,7 @@ class RayTracedBlock(nn.Module):
         )
 
     def forward(
-        self, voxels: Tensor, pixels: Tensor, pairs: PairList, *, update_pixels: bool = True
+        self, voxels: Tensor, pixels: Tensor, pairs: PairList | BlockPairs, *, update_pixels: bool = True
     ) -> tuple[Tensor, Tensor]:
         """Return the two representations after the block.
 
@@ -79,7 +80,7 @@ class Stream(nn.Module):
             channels=channels, hidden=expansion * channels, dimensions=dimensions
         )
 
-    def forward(self, stream: Tensor, target: Tensor, source: Tensor, pairs: PairList) -> Tensor:
+    def forward(self, stream: Tensor, target: Tensor, source: Tensor, pairs: PairList | BlockPairs) -> Tensor:
         """Return the stream after attention and feed-forward.
 
         Args:
@@ -91,14 +92,20 @@ class Stream(nn.Module):
         Returns:
             ``(n, ..., C)``.
         """
-        query, key, value = self.query(target), self.key(source), self.value(source)
-        attended = ray_attention(
-            self._heads(query), self._heads(key), self._heads(value), pairs, direction=self.direction
-        )
+        query, (key, value) = self.heads(self.query(target)), self.keys_and_values(source)
+        return self.finish(stream, ray_attention(query, key, value, pairs, direction=self.direction))
+
+    def keys_and_values(self, source: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what sources ``(m, ..., C)`` are scored by and what they contribute, ``(S, H, D)`` each."""
+        return self.heads(self.key(source)), self.heads(self.value(source))
+
+    def finish(self, stream: Tensor, attended: Tensor) -> Tensor:
+        """Add what was attended to, ``(T, H, D)``, to the stream ``(n, ..., C)``, then the feed-forward."""
         stream = stream + self.output(attended.flatten(1)).view(stream.shape)
         return stream + self.feed_forward(self.norm(stream))
 
-    def _heads(self, x: Tensor) -> Tensor:
+    def heads(self, x: Tensor) -> Tensor:
+        """Map ``(n, ..., C)`` to ``(T, H, D)``."""
         return x.reshape(-1, self.num_heads, x.shape[-1] // self.num_heads)
 
 

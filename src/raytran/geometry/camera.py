@@ -52,9 +52,10 @@ class Cameras:
         The first row of K is scaled by W'/W and the second by H'/H, so the resize need not keep the aspect.
         """
         height, width = image_size
-        factor = [width / self.image_size[1], height / self.image_size[0], 1.0]
-        rows = torch.tensor(factor, dtype=self.intrinsics.dtype, device=self.intrinsics.device)
-        return Cameras(self.intrinsics * rows[:, None], self.world_from_camera, (height, width))
+        # Row by row: to put the factors into a tensor on a GPU would make the host wait for it.
+        first, second, third = self.intrinsics.unbind(dim=-2)
+        rows = [first * (width / self.image_size[1]), second * (height / self.image_size[0]), third]
+        return Cameras(torch.stack(rows, dim=-2), self.world_from_camera, (height, width))
 
     def cell_rays(self, feature_size: tuple[int, int], rays_per_cell: int = 1) -> tuple[Tensor, Tensor]:
         """Cast rays through the cells of an ``h × w`` map laid over the image.
@@ -79,7 +80,9 @@ class Cameras:
         u = torch.arange(width, dtype=dtype, device=device)[None, :, None, None] + part
         v, u = torch.broadcast_tensors(v, u)
         image = torch.stack([u, v, torch.ones_like(u)], dim=-1).reshape(-1, 3)
-        world_from_image = self.world_from_camera[..., :3, :3] @ torch.linalg.inv(scaled.intrinsics)
+        # On a GPU an error check would make the host wait.
+        inverse, _ = torch.linalg.inv_ex(scaled.intrinsics, check_errors=not scaled.intrinsics.is_cuda)
+        world_from_image = self.world_from_camera[..., :3, :3] @ inverse
         rays = torch.einsum("...ij,kj->...ki", world_from_image, image)
         directions = rays.unflatten(-2, (height, width, n * n))
         return self.position[..., None, None, None, :], directions

@@ -69,4 +69,5 @@ class VoxelGrid:
         return (index[..., 0] * y + index[..., 1]) * z + index[..., 2]
 
     def _vector(self, values: tuple[float, ...]) -> Tensor:
-        return torch.tensor(values, dtype=self.center.dtype, device=self.center.device)
+        # Not torch.tensor: a copy to a GPU would make the host wait for it.
+        return torch.stack([self.center.new_full((), value) for value in values])

@@ -57,10 +57,10 @@ class ObjectHead(nn.Module):
         super().__init__()
         if queries not in ("learned", "proposal"):
             raise ConfigError(f"unknown queries={queries}: choose learned or proposal")
-        extent = [float(length) for length in grid_extent]
-        self.register_buffer("extent", torch.tensor(extent), persistent=False)
+        self.grid_extent = tuple(float(length) for length in grid_extent)
+        self.register_buffer("extent", torch.tensor(self.grid_extent), persistent=False)
         self.queries: nn.Module = (
-            LearnedQueries(channels=channels, num_queries=num_queries, extent=extent)
+            LearnedQueries(channels=channels, num_queries=num_queries, extent=self.grid_extent)
             if queries == "learned"
             else ProposalQueries(channels=channels, num_queries=num_queries)
         )
@@ -94,7 +94,7 @@ class ObjectHead(nn.Module):
 
     def _locate(self, points: Tensor) -> Tensor:
         """Return the code ``(..., C)`` of points ``(..., 3)``, metres from the centre of the volume."""
-        return self.position(position_code(points, self.extent.tolist(), self.position.in_features))
+        return self.position(position_code(points, self.grid_extent, self.position.in_features))
 
 
 class ObjectPredictor(nn.Module):

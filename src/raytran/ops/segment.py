@@ -38,9 +38,11 @@ def segment_max(values: Tensor, order: PairOrder) -> Tensor:
 
 def sampled_product(rows: Tensor, cols: Tensor, order: PairOrder) -> Tensor:
     """Return the dot product of both sides of each pair: ``rows (R, D), cols (S, D) -> (P,)``."""
-    zeros = rows.new_zeros(order.col_index.shape)
-    matrix = _matrix(zeros, order, cols.shape[0])
-    return torch.sparse.sampled_addmm(matrix, rows, cols.t(), beta=0.0).values()
+    values = rows.new_zeros(order.col_index.shape)
+    matrix = _matrix(values, order, cols.shape[0])
+    # Into the same matrix, or torch copies its indices too.
+    torch.sparse.sampled_addmm(matrix, rows, cols.t(), beta=0.0, out=matrix)
+    return values
 
 
 def sparse_product(values: Tensor, cols: Tensor, order: PairOrder) -> Tensor:

@@ -10,14 +10,16 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from raytran.errors import check_shape
+from raytran.ops.block_pairs import BlockPairs
+from raytran.ops.fused import fused_blocks, listed
 from raytran.ops.pairs import PairList, PairOrder
 from raytran.ops.segment import sparse_product
 
 
-def splat_features(features: Tensor, pairs: PairList) -> tuple[Tensor, Tensor]:
+def splat_features(features: Tensor, pairs: PairList | BlockPairs) -> tuple[Tensor, Tensor]:
     """Average over each voxel the features of the pixels paired with it.
 
-    Half-precision input is computed in float32.
+    Half-precision input is summed in float32.
 
     Args:
         features: ``(num_pixels, C)``.
@@ -30,8 +32,18 @@ def splat_features(features: Tensor, pairs: PairList) -> tuple[Tensor, Tensor]:
     Raises:
         ShapeError: the number of pixels is not that of ``pairs``.
     """
-    check_shape(features, f"{pairs.num_pixels} C", "features")
+    if features.ndim != 2 or features.shape[0] != pairs.num_pixels:
+        check_shape(features, f"{pairs.num_pixels} C", "features")
+    blocks = fused_blocks(pairs, features.device, features.dtype)
+    if blocks is not None:
+        # CPU installations of torch lack Triton: its module is imported only where it runs.
+        from raytran.ops.block_sum import block_sum
+
+        count = blocks.pixels_per_voxel()
+        mean = block_sum(features, blocks) / count.clamp(min=1)[:, None]
+        return mean.to(features.dtype), count > 0
     dtype = torch.promote_types(features.dtype, torch.float32)
+    pairs = listed(pairs)
     by_voxel, by_pixel = pairs.by("voxels"), pairs.by("pixels")
     with torch.autocast(features.device.type, enabled=False):
         mean = _Splat.apply(features.to(dtype), by_voxel, by_pixel)

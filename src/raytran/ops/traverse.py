@@ -70,7 +70,8 @@ def trace_pairs(
     Raises:
         ShapeError: cameras and grid have other leading shapes.
     """
-    rays, scenes = _rays_in_grid(cameras, grid, feature_size, rays_per_cell)
+    origin, direction = voxel_rays(cameras, grid, feature_size, rays_per_cell)
+    rays, scenes = _rays_in_grid(origin, direction, grid.resolution), origin.shape[:-2].numel()
     rays_per_pixel = rays_per_cell**2
     num_pixels = rays.first.shape[0] // rays_per_pixel
     at_once = _AT_ONCE.get(rays.first.device.type, _AT_ONCE_ELSEWHERE) // max(grid.resolution)
@@ -85,13 +86,36 @@ def trace_pairs(
     voxel_index = key - pixel_index * grid.num_voxels
     if scenes > 1:
         voxel_index += pixel_index.div(num_pixels // scenes, rounding_mode="floor") * grid.num_voxels
-    return PairList(pixel_index, voxel_index, num_pixels, scenes * grid.num_voxels)
+    views = num_pixels // (feature_size[0] * feature_size[1])
+    return PairList(
+        pixel_index,
+        voxel_index,
+        num_pixels,
+        scenes * grid.num_voxels,
+        pixel_shape=(views, *feature_size),
+        voxel_shape=(scenes, *grid.resolution),
+    )
 
 
-def _rays_in_grid(
+def voxel_rays(
     cameras: Cameras, grid: VoxelGrid, feature_size: tuple[int, int], rays_per_cell: int
-) -> tuple[_Rays, int]:
-    """Return the rays of all pixels, those of a pixel one after another, and the number of scenes."""
+) -> tuple[Tensor, Tensor]:
+    """Return the rays of all pixels in voxel coordinates and voxels per metre of depth, float64.
+
+    Slopes and offsets from the grid's planes that are nothing but rounding are zero.
+
+    Args:
+        cameras: as in ``trace_pairs``.
+        grid: as in ``trace_pairs``.
+        feature_size: ``(h, w)``.
+        rays_per_cell: n.
+
+    Returns:
+        origins ``(B, N, 3)`` and directions ``(B, N, h·w·n·n, 3)``, without B for cameras ``(N,)``.
+
+    Raises:
+        ShapeError: cameras and grid have other leading shapes.
+    """
     lead, scenes = cameras.intrinsics.shape[:-2], grid.center.shape[:-1]
     if len(lead) not in (1, 2) or (scenes != () and scenes != lead[:-1]):
         raise ShapeError(
@@ -103,12 +127,16 @@ def _rays_in_grid(
     grid = VoxelGrid(grid.resolution, grid.extent, grid.center.double().to(direction.device))
     direction = (direction / grid.voxel_size).flatten(-4, -2)
     direction = direction.masked_fill_(direction.abs() < _PARALLEL, 0.0)
-    origin = grid.voxel_from_world(precise.position)[..., None, :]
-    origin = torch.where((origin - origin.round()).abs() < NUDGE, origin.round(), origin)
+    origin = grid.voxel_from_world(precise.position)
+    return torch.where((origin - origin.round()).abs() < NUDGE, origin.round(), origin), direction
+
+
+def _rays_in_grid(origin: Tensor, direction: Tensor, resolution: tuple[int, int, int]) -> _Rays:
+    """Return the rays of ``voxel_rays``, those of a pixel one after another, with where they are inside."""
     origin, direction = (
-        part.reshape(-1, 3).T.contiguous() for part in (origin.expand_as(direction), direction)
+        part.reshape(-1, 3).T.contiguous() for part in (origin[..., None, :].expand_as(direction), direction)
     )
-    return _Rays(origin, direction, *_clip(origin, direction, grid.resolution)), lead[:-1].numel()
+    return _Rays(origin, direction, *_clip(origin, direction, resolution))
 
 
 def _clip(origin: Tensor, direction: Tensor, resolution: tuple[int, int, int]) -> tuple[Tensor, Tensor]:

@@ -50,6 +50,7 @@ def build_module(cfg: DictConfig, model: RayTran) -> Reconstruction:
         loss=instantiate(cfg.loss, _convert_="all"),
         stage=instantiate(cfg.stage, _convert_="all"),
         optimization=instantiate(cfg.optimizer, _convert_="all"),
+        compiled=cfg.compile,
     )
 
 

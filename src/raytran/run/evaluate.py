@@ -80,6 +80,7 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
         output=output,
         score_threshold=cfg.score_threshold,
         duplicate_iou=cfg.duplicate_iou,
+        views_at_once=cfg.views_at_once,
         about={
             "checkpoint": str(cfg.checkpoint),
             "data": str(data.root),
@@ -119,6 +120,7 @@ def evaluate_model(
     output: Path | None = None,
     score_threshold: float = SCORE_THRESHOLD,
     duplicate_iou: float | None = DUPLICATE_IOU,
+    views_at_once: int | None = None,
     about: Mapping[str, str] | None = None,
     progress: bool = True,
 ) -> dict[str, Any]:
@@ -133,6 +135,7 @@ def evaluate_model(
             or not at all; None writes nothing.
         score_threshold: objects with a lower score do not count as predicted.
         duplicate_iou: nor does one that overlaps a surer one of its class by more than this IoU.
+        views_at_once: views that pass through the network together, None for all.
         about: what to say beside the numbers, e.g. the checkpoint.
         progress: show a progress bar.
 
@@ -150,7 +153,7 @@ def evaluate_model(
     ).to(device)
     model.eval()
     for index in track(range(len(dataset)), "evaluating", disable=not progress, transient=True):  # type: ignore[arg-type]
-        _predict_and_compare(model, dataset[index].to(device), scores, score_threshold)
+        _predict_and_compare(model, dataset[index].to(device), scores, score_threshold, views_at_once)
     settings = {"score_threshold": score_threshold, "duplicate_iou": duplicate_iou}
     metrics = {**(about or {}), **settings, **_by_protocol(scores)}
     if output is not None:
@@ -163,9 +166,13 @@ def evaluate_model(
 
 @torch.no_grad()
 def _predict_and_compare(
-    model: RayTran, batch: SceneBatch, scores: SceneScores, score_threshold: float
+    model: RayTran,
+    batch: SceneBatch,
+    scores: SceneScores,
+    score_threshold: float,
+    views_at_once: int | None,
 ) -> None:
-    raw = model(batch.views, tasks=TASKS, grid_center=batch.grid_center)
+    raw = model(batch.views, tasks=TASKS, grid_center=batch.grid_center, views_at_once=views_at_once)
     scores.update(batch, model.decode(raw, batch.scene_id, with_shapes=False))
     if scores.shape is not None:
         scores.update_shapes(batch, model.decode(raw, batch.scene_id, score_threshold=score_threshold))

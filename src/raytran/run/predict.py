@@ -75,6 +75,7 @@ def predict(cfg: DictConfig) -> Path:
         scene_id=scene.stem if scene.is_file() else scene.name,
         score_threshold=cfg.score_threshold,
         duplicate_iou=cfg.duplicate_iou,
+        views_at_once=cfg.views_at_once,
     )
     write_scene(output, found, views, frame_ids, grid_extent=model.grid_extent, num_overlays=cfg.num_overlays)
     _report(output, found)
@@ -82,7 +83,13 @@ def predict(cfg: DictConfig) -> Path:
 
 
 def predict_scene(
-    model: RayTran, views: Views, *, scene_id: str, score_threshold: float, duplicate_iou: float | None
+    model: RayTran,
+    views: Views,
+    *,
+    scene_id: str,
+    score_threshold: float,
+    duplicate_iou: float | None,
+    views_at_once: int | None = None,
 ) -> PredictedScene:
     """Run the network on the views of one scene and make meshes of the objects it found.
 
@@ -92,13 +99,16 @@ def predict_scene(
         scene_id: name to give the result.
         score_threshold: objects with a lower score are left out.
         duplicate_iou: of two objects of a class with a higher box IoU, the weaker is left out; None: neither.
+        views_at_once: views that pass through the network together, None for all; fewer need less memory.
 
     Returns:
         The result, on the CPU.
     """
     device = next(model.parameters()).device
-    raw = model.predict(views.to(device), scene_id=scene_id, score_threshold=score_threshold).to("cpu")
-    prediction = select_objects(raw, score_threshold=score_threshold, duplicate_iou=duplicate_iou)
+    raw = model.predict(
+        views.to(device), scene_id=scene_id, score_threshold=score_threshold, views_at_once=views_at_once
+    )
+    prediction = select_objects(raw.to("cpu"), score_threshold=score_threshold, duplicate_iou=duplicate_iou)
     return PredictedScene(prediction, object_meshes(prediction))
 
 

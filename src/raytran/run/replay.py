@@ -18,11 +18,12 @@ from raytran.errors import CheckpointError, ConfigError
 from raytran.losses.matcher import HungarianMatcher
 from raytran.losses.total import TotalLoss
 from raytran.model import RayTran
+from raytran.parcel import Parcel
 from raytran.run.checkpoint import model_from
 from raytran.run.device import choose_device
 from raytran.training.replay_file import read_replay
 from raytran.training.stage import Stage
-from raytran.types import Parcel, SceneBatch
+from raytran.types import SceneBatch
 
 PRECISIONS = {"32-true": None, "bf16-mixed": torch.bfloat16, "16-mixed": torch.float16}
 

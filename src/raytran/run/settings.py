@@ -28,6 +28,7 @@ class RunConfig:
         check_parent: ``scores`` refuses a parent of another stage or one that has not learned its task,
             ``stage`` only the former, ``none`` nothing.
         resume: ``none``, ``auto``, or the checkpoint of an interrupted run to continue.
+        compile: run the network through ``torch.compile``.
         checkpoint_every: optimiser steps between two writings of the last checkpoint.
         progress_bar: ``rich``, ``tqdm`` or ``none``.
     """
@@ -40,6 +41,7 @@ class RunConfig:
     init_from: str
     check_parent: str
     resume: str
+    compile: bool
     checkpoint_every: int
     progress_bar: str
 

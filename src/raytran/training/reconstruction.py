@@ -25,15 +25,26 @@ class Reconstruction(pl.LightningModule):
         loss: all loss terms; the stage says which count.
         stage: what trains.
         optimization: optimiser and schedule.
+        compiled: run the model through ``torch.compile``. What is compiled is the function, not the module,
+            so that weights keep their names.
     """
 
-    def __init__(self, *, model: RayTran, loss: TotalLoss, stage: Stage, optimization: Optimization) -> None:
+    def __init__(
+        self,
+        *,
+        model: RayTran,
+        loss: TotalLoss,
+        stage: Stage,
+        optimization: Optimization,
+        compiled: bool = False,
+    ) -> None:
         super().__init__()
         self.model = model
         self.loss = loss
         self.stage = stage
         self.optimization = optimization
         self.scores = SceneScores(tasks=stage.tasks)
+        self._forward = torch.compile(model.forward) if compiled else model.forward
 
     def train(self, mode: bool = True) -> Self:
         """Set the mode; frozen parts stay in evaluation mode whatever Lightning asks for."""
@@ -62,7 +73,7 @@ class Reconstruction(pl.LightningModule):
         return self.optimization.build(self.model.parameters(), int(self.trainer.estimated_stepping_batches))
 
     def _run_model(self, batch: SceneBatch) -> RawScene:
-        return self.model(batch.views, tasks=self.stage.tasks, grid_center=batch.grid_center)
+        return self._forward(batch.views, tasks=self.stage.tasks, grid_center=batch.grid_center)
 
     def _losses(self, raw: RawScene, batch: SceneBatch, split: str) -> dict[str, Tensor]:
         losses = self.loss(
