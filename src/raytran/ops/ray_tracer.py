@@ -44,7 +44,7 @@ class RayTracer:
         headroom: room for block pairs, as a multiple of the most that a tile has met on average.
     """
 
-    def __init__(self, headroom: float = 2.0) -> None:
+    def __init__(self, headroom: float = 1.5) -> None:
         self._headroom = headroom
         self._most_per_tile = 0.0
         self._readings: list[_Reading] = []
