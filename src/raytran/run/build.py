@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from raytran.run.folders import LAST
 from raytran.run.loggers import METRICS
 from raytran.run.settings import RunConfig
+from raytran.run.watch import watching_callbacks
 from raytran.training.callbacks.effective_batch import EffectiveBatch
 from raytran.training.callbacks.last_checkpoint import LastCheckpoint
 from raytran.training.callbacks.rank_agreement import RankAgreement
@@ -88,6 +89,7 @@ def build_trainer(cfg: DictConfig, run: RunConfig, card: dict[str, Any]) -> pl.T
         EffectiveBatch(per_device=cfg.data.batch_size, expected=cfg.schedule.batch),
         RankAgreement(),
         LastCheckpoint(folder / LAST, every_n_steps=run.checkpoint_every, card=card),
+        *watching_callbacks(cfg, run, card),
     ]
     if run.progress_bar == "rich":
         callbacks.append(StepProgress(f"stage {card['stage']}"))

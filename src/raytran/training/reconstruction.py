@@ -12,6 +12,7 @@ from torchmetrics import MeanMetric
 
 from raytran.losses.total import TotalLoss
 from raytran.model import RayTran
+from raytran.training.health_signals import StepOutcome
 from raytran.training.optim import Optimization
 from raytran.training.ranks import mean_over_ranks
 from raytran.training.scores import SceneScores
@@ -27,6 +28,9 @@ class Reconstruction(pl.LightningModule):
         loss: all loss terms; the stage says which count.
         stage: what trains.
         optimization: optimiser and schedule.
+
+    Attributes:
+        outcome: what the last training step gave, for callbacks.
     """
 
     def __init__(self, *, model: RayTran, loss: TotalLoss, stage: Stage, optimization: Optimization) -> None:
@@ -36,6 +40,7 @@ class Reconstruction(pl.LightningModule):
         self.stage = stage
         self.optimization = optimization
         self.scores = SceneScores(tasks=stage.tasks)
+        self.outcome: StepOutcome | None = None
         self._val_losses: dict[str, MeanMetric] = {}
 
     def train(self, mode: bool = True) -> Self:
@@ -46,9 +51,11 @@ class Reconstruction(pl.LightningModule):
 
     def training_step(self, batch: SceneBatch, batch_idx: int) -> Tensor:
         """Return the loss to minimise; log its terms, means over all ranks."""
-        losses = self._losses(self._run_model(batch), batch, mean_over_ranks=mean_over_ranks)
+        raw = self._run_model(batch)
+        losses = self._losses(raw, batch, mean_over_ranks=mean_over_ranks)
         means = mean_over_ranks(torch.stack([value.detach() for value in losses.values()]))
-        for name, value in zip(losses, means, strict=True):
+        self.outcome = StepOutcome.of(dict(zip(losses, means, strict=True)), raw)
+        for name, value in self.outcome.losses.items():
             self.log(f"train/{name}", value, prog_bar=name == "total")
         return losses["total"]
 
