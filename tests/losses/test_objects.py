@@ -19,7 +19,12 @@ def test_padding_is_weighted(make_objects, make_perfect, no_object_weight: float
 
     def class_loss() -> float:
         found = object_losses(
-            raw, [objects], match, num_objects=torch.tensor(1.0), no_object_weight=no_object_weight
+            raw,
+            [objects],
+            match,
+            num_objects=torch.tensor(1.0),
+            class_weight=torch.tensor(1 + 2 * no_object_weight),
+            no_object_weight=no_object_weight,
         )
         return float(found["class"].detach())
 

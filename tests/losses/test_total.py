@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import fields
+
 import pytest
 import torch
 
@@ -9,7 +12,7 @@ from raytran.geometry.grid import VoxelGrid
 from raytran.heads.objects import ObjectHead
 from raytran.losses.matcher import HungarianMatcher
 from raytran.losses.total import TotalLoss
-from raytran.types import ObjectSet, RawScene, SceneBatch, Views
+from raytran.types import ObjectSet, RawObjects, RawScene, SceneBatch, Views
 
 WEIGHTS = {
     "occupancy": 1.0,
@@ -59,8 +62,63 @@ def test_pose_terms_are_means_over_objects(make_objects, make_perfect) -> None:
     assert float(total_loss()(scene, batch(objects), terms=("objects",))["objects/center"]) == pytest.approx(
         0.95
     )
-    over_four = total_loss()(scene, batch(objects), terms=("objects",), num_objects=torch.tensor(4.0))
-    assert float(over_four["objects/center"]) == pytest.approx(0.475)
+
+
+def join(*parts: RawObjects) -> RawObjects:
+    return RawObjects(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(RawObjects)))
+
+
+@pytest.mark.parametrize("counts", [(3, 1), (2, 0), (1, 0), (0, 0), (6, 2)])
+def test_ranks_of_one_scene_take_the_step_of_one_rank(counts, make_objects) -> None:
+    """Sums over objects and slots have one divisor for all ranks: the mean over ranks is the whole."""
+    scenes = [make_objects(count, seed) for seed, count in enumerate(counts)]
+    g = torch.Generator().manual_seed(5)
+    raws = [RawObjects(*(torch.randn(1, 4, size, generator=g) for size in (10, 3, 3, 2, 4))) for _ in counts]
+    decode = torch.nn.Sequential(torch.nn.Linear(4, 125), torch.nn.Unflatten(1, (5, 5, 5)))
+    loss, options = total_loss(), {"terms": ("objects", "shape"), "decode_shapes": decode}
+    whole = loss(RawScene(torch.zeros(2, 3), objects=(join(*raws),)), batch(*scenes), **options)
+
+    asked = []  # what each rank has to divide by
+
+    def collect(divisors: torch.Tensor) -> torch.Tensor:
+        asked.append(divisors)
+        return divisors
+
+    def rank(index: int, mean: Callable[[torch.Tensor], torch.Tensor]) -> dict[str, torch.Tensor]:
+        scene = RawScene(torch.zeros(1, 3), objects=(raws[index],))
+        return loss(scene, batch(scenes[index]), mean_over_ranks=mean, **options)
+
+    for index in range(2):
+        rank(index, collect)
+    mean = torch.stack(asked).mean(dim=0)
+    ranks = [rank(index, lambda _: mean) for index in range(2)]
+    for name, value in whole.items():
+        assert float(value) == pytest.approx(sum(float(r[name]) for r in ranks) / 2, abs=1e-5), name
+
+
+def test_everything_is_float32_under_autocast(make_objects) -> None:
+    """16 bits in, the sum of float32 terms out; only the network's shape decoder sees autocast."""
+    objects = make_objects(2)
+    g = torch.Generator().manual_seed(5)
+    half = [torch.randn(1, 4, size, generator=g).bfloat16() for size in (10, 3, 3, 2, 4)]
+    raw = RawObjects(*half)
+    exact = RawObjects(*(value.float() for value in half))
+    grid, image = torch.randn(1, 2, 2, 2, generator=g), torch.randn(1, 1, 4, 4, generator=g)
+    targets = batch(objects, occupancy=grid > 0, foreground=image > 0)
+    seen = []
+
+    def decode(embedding: torch.Tensor) -> torch.Tensor:
+        seen.append((torch.is_autocast_enabled("cpu"), embedding.dtype))
+        return torch.zeros(len(embedding), 5, 5, 5, dtype=embedding.dtype)
+
+    options = {"terms": ("occupancy", "foreground", "objects", "shape"), "decode_shapes": decode}
+    wanted = total_loss()(RawScene(torch.zeros(1, 3), grid, image, (exact,)), targets, **options)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        scene = RawScene(torch.zeros(1, 3), grid, image, (raw,))
+        found = total_loss()(scene, targets, **options)
+    assert seen == [(False, torch.float32), (True, torch.bfloat16)]
+    assert {value.dtype for value in found.values()} == {torch.float32}
+    assert {n: float(v) for n, v in found.items()} == {n: float(v) for n, v in wanted.items()}
 
 
 def test_shape_is_decoded_for_matched_slots_only(make_objects, make_perfect) -> None:

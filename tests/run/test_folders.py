@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import json
 import os
+from pathlib import Path
 
 import pytest
 
@@ -10,12 +11,15 @@ from raytran.errors import CheckpointError, ConfigError
 from raytran.run.folders import (
     FINISHED,
     LAST,
+    PREVIOUS,
     newest_finished,
     newest_unfinished,
+    one_at_a_time,
     read_finished,
     run_folder,
     write_finished,
 )
+from raytran.training.checkpoint_file import LAST_NAME, PREVIOUS_NAME
 
 
 def make_run(folder, *, stage="occupancy", preset="tiny", finished=None, age=0.0):
@@ -73,6 +77,27 @@ def test_the_newest_unfinished_run_is_found(tmp_path):
     (tmp_path / "failed before its first checkpoint").mkdir()
     assert newest_unfinished(tmp_path, LAST) == newest
     assert newest_unfinished(tmp_path / "nothing", LAST) is None
+
+
+def test_a_run_with_only_the_checkpoint_before_the_last_is_found(tmp_path):
+    assert Path("checkpoints") / PREVIOUS_NAME == PREVIOUS
+    assert Path("checkpoints") / LAST_NAME == LAST
+    make_run(tmp_path / "old", age=100.0)
+    newest = make_run(tmp_path / "new", age=50.0)
+    (newest / LAST).rename(newest / PREVIOUS)
+    assert newest_unfinished(tmp_path, LAST) == newest
+    assert newest_unfinished(tmp_path, Path("curriculum.json")) is None
+
+
+def test_one_process_a_folder(tmp_path):
+    with (
+        one_at_a_time(tmp_path / "run"),
+        pytest.raises(ConfigError, match="another process trains in"),
+        one_at_a_time(tmp_path / "run"),
+    ):
+        pass
+    with one_at_a_time(tmp_path / "run"):
+        pass
 
 
 def test_resume_decides_the_folder(tmp_path):

@@ -85,6 +85,10 @@ def config(folder, output, **changes) -> DictConfig:
         "scene": str(folder),
         "output": str(output),
         "format": "auto",
+        "up": "auto",
+        "scale": None,
+        "convention": "auto",
+        "check": True,
         "num_views": None,
         "score_threshold": 0.5,
         "duplicate_iou": 0.5,
@@ -169,7 +173,7 @@ def test_nothing_found_is_a_result_and_is_said(scene, oracle, tmp_path, caplog):
 @pytest.mark.parametrize(
     ("changes", "error", "message"),
     [
-        ({"format": "colmap"}, ConfigError, "unknown format=colmap: choose one of auto, scannet"),
+        ({"format": "kitti"}, ConfigError, "unknown format=kitti: choose one of auto, scannet"),
         ({"device": "abacus"}, ConfigError, "cannot use device=abacus"),
         ({"scene": "nowhere"}, DataError, "nowhere"),
     ],

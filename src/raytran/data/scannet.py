@@ -146,12 +146,31 @@ def load_views(
         DataError: see ``open_scan``; or fewer than two images can be read.
     """
     with open_scan(Path(folder)) as scan:
-        if scan.dropped:
-            total = len(scan) + len(scan.dropped)
-            reasons = ", ".join(sorted(set(scan.dropped.values())))
-            _log.info("%s: dropped %d of %d frames (%s)", scan.scene_id, len(scan.dropped), total, reasons)
-        views, used = scan_views(scan, choose_even(len(scan), num_views).tolist(), image_size=image_size)
-        return views, tuple(scan.frame_id[i] for i in used)
+        return even_views(scan, image_size=image_size, num_views=num_views)
+
+
+def even_views(
+    scan: OpenScan, *, image_size: tuple[int, int], num_views: int
+) -> tuple[Views, tuple[str, ...]]:
+    """Read evenly spread frames of an open scan; how many have no image or pose is logged.
+
+    Args:
+        scan: of any source.
+        image_size: ``(H, W)`` to which the images are resized; the intrinsics follow.
+        num_views: N.
+
+    Returns:
+        the views with B = 1 and the name of each frame.
+
+    Raises:
+        DataError: fewer than two images can be read.
+    """
+    if scan.dropped:
+        total = len(scan) + len(scan.dropped)
+        reasons = ", ".join(sorted(set(scan.dropped.values())))
+        _log.info("%s: dropped %d of %d frames (%s)", scan.scene_id, len(scan.dropped), total, reasons)
+    views, used = scan_views(scan, choose_even(len(scan), num_views).tolist(), image_size=image_size)
+    return views, tuple(scan.frame_id[i] for i in used)
 
 
 def scan_views(
@@ -186,7 +205,7 @@ def scan_views(
 def _read_layout(layout: Layout, header: Path | None, any_size: bool) -> Scan:
     folder = layout.scan
     images, pose_files = layout.images(), layout.poses()
-    both = sorted(images.keys() & pose_files.keys(), key=_numbers_first)
+    both = sorted(images.keys() & pose_files.keys(), key=numbers_first)
     dropped = {name: NO_IMAGE for name in pose_files.keys() - images.keys()}
     dropped |= {name: NO_POSE for name in images.keys() - pose_files.keys()}
     matrices = [read_matrix(pose_files[name]) for name in both]
@@ -214,7 +233,7 @@ def _read_layout(layout: Layout, header: Path | None, any_size: bool) -> Scan:
         ),
         image_size=image_size,
         axis_alignment=axis_alignment(facts, header),
-        dropped={name: dropped[name] for name in sorted(dropped, key=_numbers_first)},
+        dropped={name: dropped[name] for name in sorted(dropped, key=numbers_first)},
     )
 
 
@@ -222,7 +241,7 @@ def _as_tensor(image: NDArray[np.uint8]) -> Tensor:
     return torch.from_numpy(image).permute(2, 0, 1)
 
 
-def _numbers_first(name: str) -> list[tuple[int, int, str]]:
+def numbers_first(name: str) -> list[tuple[int, int, str]]:
     """Key that sorts frame names by the numbers in them: 9 before 10, frame-9 before frame-10."""
     parts = re.findall(r"\d+|\D+", name)
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]

@@ -20,6 +20,7 @@ def object_losses(
     matches: Sequence[Match],
     *,
     num_objects: Tensor,
+    class_weight: Tensor,
     no_object_weight: float,
 ) -> dict[str, Tensor]:
     """Return the class and pose losses of one decoder layer.
@@ -29,6 +30,8 @@ def object_losses(
         targets: true objects of B scenes.
         matches: pairs of slots and true objects.
         num_objects: scalar by which the pose losses' sums are divided.
+        class_weight: scalar by which the cross entropies' weighted sum over slots is divided; the sum of the
+            weights gives their mean.
         no_object_weight: weight of the padding class in the cross entropy.
 
     Returns:
@@ -46,8 +49,9 @@ def object_losses(
         )
         for name, error in errors.items():
             losses[name] = losses[name] + error.sum() / num_objects
-    class_weight = torch.ones(PADDING + 1, device=label.device)
-    class_weight[PADDING] = no_object_weight
+    weight_of = torch.ones(PADDING + 1, device=label.device)
+    weight_of[PADDING] = no_object_weight
     logits = raw.class_logits.float().flatten(0, 1)
-    losses["class"] = F.cross_entropy(logits, label.flatten(), weight=class_weight)
+    entropy = F.cross_entropy(logits, label.flatten(), weight=weight_of, reduction="sum")
+    losses["class"] = entropy / class_weight
     return losses

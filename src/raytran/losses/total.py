@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import fields, replace
 from typing import TypeVar
 
 import torch
@@ -54,17 +55,20 @@ class TotalLoss(nn.Module):
         *,
         terms: Collection[str],
         decode_shapes: Callable[[Tensor], Tensor] | None = None,
-        num_objects: Tensor | None = None,
+        mean_over_ranks: Callable[[Tensor], Tensor] | None = None,
     ) -> dict[str, Tensor]:
-        """Return the unweighted terms and their weighted sum ``total``.
+        """Return the unweighted terms and their weighted sum ``total``, in float32 also under autocast.
+
+        Terms of objects are sums over objects, or over slots, divided by their number or total weight in all
+        scenes of the step. So the mean over ranks of the gradients is that of one rank with all the scenes.
 
         Args:
             raw: what the network returned.
             batch: the targets.
             terms: some of ``TERMS``.
             decode_shapes: shape logits ``(M, S, S, S)`` of query embeddings ``(M, C)``; needed for ``shape``.
-            num_objects: scalar by which sums over objects are divided; by default the objects in ``batch``,
-                at least one.
+            mean_over_ranks: returns the mean of a vector over the ranks that share the step, all with as many
+                scenes; None where there is one rank.
 
         Returns:
             ``occupancy``, ``foreground``, ``shape``; ``objects/class``, ``objects/center``, ``objects/size``,
@@ -79,13 +83,18 @@ class TotalLoss(nn.Module):
         if unknown or not terms:
             raise ConfigError(f"expected loss terms out of {TERMS}, got {sorted(terms)}")
         losses: dict[str, Tensor] = {}
-        if "occupancy" in terms:
-            losses["occupancy"] = occupancy_loss(*_both("occupancy", raw.occupancy, batch.occupancy))
-        if "foreground" in terms:
-            losses["foreground"] = foreground_loss(*_both("foreground", raw.foreground, batch.foreground))
-        if "objects" in terms or "shape" in terms:
-            losses |= self._objects(raw, batch, terms, decode_shapes, num_objects)
-        losses["total"] = torch.stack([self._weight(name) * value for name, value in losses.items()]).sum()
+        device = raw.grid_center.device.type
+        if decode_shapes is not None:
+            decode_shapes = _under_current_autocast(decode_shapes, device)
+        with torch.autocast(device, enabled=False):
+            if "occupancy" in terms:
+                losses["occupancy"] = occupancy_loss(*_both("occupancy", raw.occupancy, batch.occupancy))
+            if "foreground" in terms:
+                losses["foreground"] = foreground_loss(*_both("foreground", raw.foreground, batch.foreground))
+            if "objects" in terms or "shape" in terms:
+                losses |= self._objects(raw, batch, terms, decode_shapes, mean_over_ranks)
+            weighted = [self._weight(name) * value for name, value in losses.items()]
+            losses["total"] = torch.stack(weighted).sum()
         return losses
 
     def _objects(
@@ -94,11 +103,11 @@ class TotalLoss(nn.Module):
         batch: SceneBatch,
         terms: Collection[str],
         decode_shapes: Callable[[Tensor], Tensor] | None,
-        num_objects: Tensor | None,
+        mean_over_ranks: Callable[[Tensor], Tensor] | None,
     ) -> dict[str, Tensor]:
         layers, targets = _both("objects", raw.objects, batch.objects)
-        if num_objects is None:
-            num_objects = layers[-1].center.new_tensor(max(1, sum(len(objects) for objects in targets)))
+        layers = tuple(_in_float32(layer) for layer in layers)
+        num_objects, class_weight = self._divisors(layers[-1], targets, mean_over_ranks)
         last = self.matcher(layers[-1], targets)
         losses: dict[str, Tensor] = {}
         if "shape" in terms:
@@ -109,7 +118,12 @@ class TotalLoss(nn.Module):
             is_last = index + 1 == len(layers)
             matches = last if is_last else self.matcher(layer, targets)
             found = object_losses(
-                layer, targets, matches, num_objects=num_objects, no_object_weight=self.no_object_weight
+                layer,
+                targets,
+                matches,
+                num_objects=num_objects,
+                class_weight=class_weight,
+                no_object_weight=self.no_object_weight,
             )
             suffix = "" if is_last else f"/layer{index}"
             losses |= {f"objects/{name}{suffix}": value for name, value in found.items()}
@@ -117,6 +131,24 @@ class TotalLoss(nn.Module):
             found = proposal_losses(raw.proposals, targets, num_objects=num_objects)
             losses |= {f"objects/{name}/proposals": value for name, value in found.items()}
         return losses
+
+    def _divisors(
+        self,
+        raw: RawObjects,
+        targets: Sequence[ObjectSet],
+        mean_over_ranks: Callable[[Tensor], Tensor] | None,
+    ) -> tuple[Tensor, Tensor]:
+        """Return the number of true objects and the slots' total weight in the cross entropy, a rank."""
+        scenes, queries = raw.class_logits.shape[:2]
+        matched = sum(min(queries, len(objects)) for objects in targets)
+        weight = matched + self.no_object_weight * (scenes * queries - matched)
+        divisors = raw.center.new_tensor([sum(len(objects) for objects in targets), weight])
+        if mean_over_ranks is not None:
+            divisors = mean_over_ranks(divisors)
+        # Without any object all sums are zero, whatever they are divided by. A bound of one would be wrong:
+        # one object on two ranks makes a half for each.
+        num_objects, class_weight = torch.where(divisors > 0, divisors, 1.0).unbind()
+        return num_objects, class_weight
 
     def _weight(self, name: str) -> float:
         """Return the weight of a term, e.g. that of ``center`` for ``objects/center/layer0``."""
@@ -141,6 +173,23 @@ def _matched_shape_loss(
         return 0.0 * decode_shapes(raw.embedding[:1, 0]).float().sum()
     wanted = [o.shape[match.target] for o, match in zip(targets, matches, strict=True) if o.shape is not None]
     return shape_loss(decode_shapes(embedding), torch.cat(wanted), num_objects=num_objects)
+
+
+def _in_float32(raw: RawObjects) -> RawObjects:
+    """Return the predictions in float32, but the embedding as the network made it: it goes back there."""
+    exact = {f.name: getattr(raw, f.name).float() for f in fields(raw) if f.name != "embedding"}
+    return replace(raw, **exact)
+
+
+def _under_current_autocast(function: Callable[[Tensor], Tensor], device: str) -> Callable[[Tensor], Tensor]:
+    """Return ``function`` so that it runs under the autocast of now, wherever it is called."""
+    enabled, dtype = torch.is_autocast_enabled(device), torch.get_autocast_dtype(device)
+
+    def call(x: Tensor) -> Tensor:
+        with torch.autocast(device, dtype=dtype, enabled=enabled):
+            return function(x)
+
+    return call
 
 
 def _both(name: str, predicted: _T | None, target: _U | None) -> tuple[_T, _U]:

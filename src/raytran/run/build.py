@@ -13,12 +13,18 @@ from lightning.pytorch.callbacks import TQDMProgressBar
 from omegaconf import DictConfig, OmegaConf
 
 from raytran.run.folders import LAST
+from raytran.run.loggers import METRICS
 from raytran.run.settings import RunConfig
+from raytran.run.watch import watching_callbacks
+from raytran.training.callbacks.effective_batch import EffectiveBatch
 from raytran.training.callbacks.last_checkpoint import LastCheckpoint
+from raytran.training.callbacks.rank_agreement import RankAgreement
 from raytran.training.callbacks.stage_setup import StageSetup
 from raytran.training.callbacks.step_progress import StepProgress
 from raytran.training.checkpoint_io import AtomicCheckpointIO
 from raytran.training.datamodule import SceneDataModule
+from raytran.training.metrics_table import MetricsTable
+from raytran.training.ranks import SyncedBatchNorm
 from raytran.training.reconstruction import Reconstruction
 
 if TYPE_CHECKING:
@@ -59,6 +65,13 @@ def build_data(cfg: DictConfig) -> SceneDataModule:
     return instantiate(cfg.data, _convert_="all")
 
 
+def choose_precision(*, on_cpu: bool) -> str:
+    """Return bf16-mixed on GPUs that compute with it, 16-mixed on older ones, 32-true on the CPU."""
+    if on_cpu:
+        return "32-true"
+    return "bf16-mixed" if torch.cuda.is_bf16_supported(including_emulation=False) else "16-mixed"
+
+
 def build_trainer(cfg: DictConfig, run: RunConfig, card: dict[str, Any]) -> pl.Trainer:
     """Return Lightning's Trainer with the callbacks of every run.
 
@@ -68,23 +81,28 @@ def build_trainer(cfg: DictConfig, run: RunConfig, card: dict[str, Any]) -> pl.T
         card: what each checkpoint carries.
     """
     settings = plain(cfg.trainer)
+    on_cpu = settings["accelerator"] == "cpu" or not torch.cuda.is_available()
     if settings["precision"] == "auto":
-        settings["precision"] = "16-mixed" if torch.cuda.is_available() else "32-true"
+        settings["precision"] = choose_precision(on_cpu=on_cpu)
     folder = Path(run.output_dir)
     callbacks: list[pl.Callback] = [
         StageSetup(),
+        EffectiveBatch(per_device=cfg.data.batch_size, expected=cfg.schedule.batch),
+        RankAgreement(),
         LastCheckpoint(folder / LAST, every_n_steps=run.checkpoint_every, card=card),
+        *watching_callbacks(cfg, run, card),
     ]
     if run.progress_bar == "rich":
         callbacks.append(StepProgress(f"stage {card['stage']}"))
     elif run.progress_bar == "tqdm":
         callbacks.append(TQDMProgressBar())
+    loggers = [instantiate(logger, _convert_="all") for logger in plain(cfg.logger).values()]
     return instantiate(
         settings,
         default_root_dir=str(folder),
-        logger=[instantiate(logger, _convert_="all") for logger in plain(cfg.logger).values()],
+        logger=[MetricsTable(folder / METRICS), *loggers],
         callbacks=callbacks,
-        plugins=[AtomicCheckpointIO()],
+        plugins=[AtomicCheckpointIO(), SyncedBatchNorm(on_cpu=on_cpu)],
         enable_progress_bar=run.progress_bar == "tqdm",
         _convert_="all",
     )

@@ -4,15 +4,16 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import trimesh
 from omegaconf import DictConfig
 
-from raytran.data.scannet import load_views
-from raytran.errors import ConfigError
+from raytran.data.importers.open import open_scene
+from raytran.data.importers.orient import WorldSettings
+from raytran.data.scannet import even_views
 from raytran.export import write_prediction
 from raytran.geometry.camera import Cameras
 from raytran.model import RayTran
@@ -25,9 +26,6 @@ from raytran.view.overlay import draw_overlays
 from raytran.view.topdown import draw_topdown
 
 _LOG = logging.getLogger(__name__)
-
-_IMPORTERS = {"auto": load_views, "scannet": load_views}
-"""Name of a folder's layout → reader of its views."""
 
 _UNTRAINED = {
     "occupancy": "its objects mean nothing yet; predict with a checkpoint of stage shape",
@@ -59,16 +57,17 @@ def predict(cfg: DictConfig) -> Path:
         DataError: the scene's folder is missing or damaged.
     """
     scene, output = Path(cfg.scene).resolve(), Path(cfg.output)
-    read_views = _importer(cfg.format)
+    world = WorldSettings(up=cfg.up, scale=cfg.scale, convention=cfg.convention, check=cfg.check)
     check_replaceable(output.resolve(), marker=MARKER)
     settings = prediction_settings(cfg.checkpoint)
     if settings.stage in _UNTRAINED:
         _LOG.warning("%s is of stage %s: %s", cfg.checkpoint, settings.stage, _UNTRAINED[settings.stage])
-    model = load_model(cfg.checkpoint).to(choose_device(cfg.device))
     num_views = cfg.num_views or settings.num_views
-    views, frame_ids = _without_repeats(
-        *read_views(scene, image_size=settings.image_size, num_views=num_views)
-    )
+    with open_scene(scene, format=cfg.format, settings=world) as scan:
+        views, frame_ids = _without_repeats(
+            *even_views(scan, image_size=settings.image_size, num_views=num_views)
+        )
+    model = load_model(cfg.checkpoint).to(choose_device(cfg.device))
     found = predict_scene(
         model,
         views,
@@ -144,12 +143,6 @@ def write_scene(
         )
         draw_overlays(folder / "overlays", views, frame_ids, prediction, found.meshes, count=num_overlays)
         write_prediction(folder, prediction, found.meshes)
-
-
-def _importer(name: str) -> Callable[..., tuple[Views, Sequence[str]]]:
-    if name not in _IMPORTERS:
-        raise ConfigError(f"unknown format={name}: choose one of {', '.join(_IMPORTERS)}")
-    return _IMPORTERS[name]
 
 
 def _without_repeats(views: Views, frame_ids: Sequence[str]) -> tuple[Views, tuple[str, ...]]:

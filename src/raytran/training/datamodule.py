@@ -103,17 +103,22 @@ class SceneDataModule(pl.LightningDataModule):
             seed=self._seed,
             first=self._place["scenes"],
         )
-        return self._loader(dataset, stream)
+        return self._loader(dataset, stream, self._batch_size)
 
     def val_dataloader(self) -> DataLoader[SceneBatch]:
-        """Return the validation scenes in order; on several ranks a few come twice, to make them even."""
-        dataset = self.split("val")
-        return self._loader(dataset, DistributedSampler(dataset, **self._ranks(), shuffle=False))
+        """Return the validation scenes in order, one by one, so that scores are the same for any batch size.
 
-    def _loader(self, dataset: Dataset[Any], sampler: DistributedSampler[Any]) -> DataLoader[SceneBatch]:
+        On several ranks a few come twice, to make them even; the module counts them once.
+        """
+        dataset = self.split("val")
+        return self._loader(dataset, DistributedSampler(dataset, **self._ranks(), shuffle=False), 1)
+
+    def _loader(
+        self, dataset: Dataset[Any], sampler: DistributedSampler[Any], batch_size: int
+    ) -> DataLoader[SceneBatch]:
         return DataLoader(
             dataset,
-            batch_size=self._batch_size,
+            batch_size=batch_size,
             sampler=sampler,
             num_workers=self._num_workers,
             persistent_workers=self._num_workers > 0,

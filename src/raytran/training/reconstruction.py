@@ -8,10 +8,13 @@ from typing import Any, Self
 import lightning.pytorch as pl
 import torch
 from torch import Tensor
+from torchmetrics import MeanMetric
 
 from raytran.losses.total import TotalLoss
 from raytran.model import RayTran
+from raytran.training.health_signals import StepOutcome
 from raytran.training.optim import Optimization
+from raytran.training.ranks import mean_over_ranks
 from raytran.training.scores import SceneScores
 from raytran.training.stage import Stage
 from raytran.types import RawScene, SceneBatch
@@ -27,6 +30,9 @@ class Reconstruction(pl.LightningModule):
         optimization: optimiser and schedule.
         compiled: run the model through ``torch.compile``. What is compiled is the function, not the module,
             so that weights keep their names.
+
+    Attributes:
+        outcome: what the last training step gave, for callbacks.
     """
 
     def __init__(
@@ -45,6 +51,8 @@ class Reconstruction(pl.LightningModule):
         self.optimization = optimization
         self.scores = SceneScores(tasks=stage.tasks)
         self._forward = torch.compile(model.forward) if compiled else model.forward
+        self.outcome: StepOutcome | None = None
+        self._val_losses: dict[str, MeanMetric] = {}
 
     def train(self, mode: bool = True) -> Self:
         """Set the mode; frozen parts stay in evaluation mode whatever Lightning asks for."""
@@ -53,20 +61,33 @@ class Reconstruction(pl.LightningModule):
         return self
 
     def training_step(self, batch: SceneBatch, batch_idx: int) -> Tensor:
-        """Return the loss to minimise."""
-        return self._losses(self._run_model(batch), batch, "train")["total"]
+        """Return the loss to minimise; log its terms, means over all ranks."""
+        raw = self._run_model(batch)
+        losses = self._losses(raw, batch, mean_over_ranks=mean_over_ranks)
+        means = mean_over_ranks(torch.stack([value.detach() for value in losses.values()]))
+        self.outcome = StepOutcome.of(dict(zip(losses, means, strict=True)), raw)
+        for name, value in self.outcome.losses.items():
+            self.log(f"train/{name}", value, prog_bar=name == "total")
+        return losses["total"]
 
     def validation_step(self, batch: SceneBatch, batch_idx: int) -> None:
-        """Log the losses and collect the scores."""
+        """Collect the losses and the scores, in float32 also under autocast."""
         raw = self._run_model(batch)
-        self._losses(raw, batch, "val")
-        self.scores.update(batch, self.model.decode(raw, batch.scene_id, with_shapes=False))
+        losses = self._losses(raw, batch)
+        weight = 0 if self._is_repeated(batch_idx) else len(batch.scene_id)
+        for name, value in losses.items():
+            mean = self._val_losses.setdefault(name, MeanMetric().to(self.device))
+            mean.update(value, weight)
+        if weight:
+            with torch.autocast(self.device.type, enabled=False):
+                self.scores.update(batch, self.model.decode(raw, batch.scene_id, with_shapes=False))
 
     def on_validation_epoch_end(self) -> None:
-        """Log the scores over all validation scenes."""
-        for name, value in self.scores.compute().items():
-            self.log(f"val/{name}", value)
+        """Log the losses and the scores over all validation scenes."""
+        losses = {name: mean.compute() for name, mean in self._val_losses.items()}
+        self.log_dict({f"val/{name}": value for name, value in (losses | self.scores.compute()).items()})
         self.scores.reset()
+        self._val_losses.clear()
 
     def configure_optimizers(self) -> Any:
         """Return AdamW over what the stage trains, with its schedule."""
@@ -75,28 +96,13 @@ class Reconstruction(pl.LightningModule):
     def _run_model(self, batch: SceneBatch) -> RawScene:
         return self._forward(batch.views, tasks=self.stage.tasks, grid_center=batch.grid_center)
 
-    def _losses(self, raw: RawScene, batch: SceneBatch, split: str) -> dict[str, Tensor]:
-        losses = self.loss(
-            raw,
-            batch,
-            terms=self.stage.terms,
-            decode_shapes=self.model.decode_shapes,
-            num_objects=self._objects_per_rank(batch) if split == "train" else None,
+    def _losses(self, raw: RawScene, batch: SceneBatch, **options: Any) -> dict[str, Tensor]:
+        return self.loss(
+            raw, batch, terms=self.stage.terms, decode_shapes=self.model.decode_shapes, **options
         )
-        is_train = split == "train"
-        for name, value in losses.items():
-            self.log(
-                f"{split}/{name}",
-                value.detach(),
-                prog_bar=is_train and name == "total",
-                sync_dist=not is_train,
-                batch_size=len(batch.scene_id),
-            )
-        return losses
 
-    def _objects_per_rank(self, batch: SceneBatch) -> Tensor | None:
-        """Return the mean over the ranks, so that DDP's mean of gradients counts all objects alike."""
-        if batch.objects is None:
-            return None
-        count = torch.tensor(float(sum(len(objects) for objects in batch.objects)), device=self.device)
-        return self.trainer.strategy.reduce(count, reduce_op="mean").clamp(min=1)
+    def _is_repeated(self, batch_idx: int) -> bool:
+        """Say whether a validation scene is there only to give every rank as many; they come one by one."""
+        place = batch_idx * self.trainer.world_size + self.trainer.global_rank
+        loader: Any = self.trainer.val_dataloaders
+        return place >= len(loader.dataset)

@@ -52,13 +52,20 @@ def draw_curves(path: Path, stages: Mapping[str, History], *, prefix: str = "tra
     return path
 
 
-def _draw_term(axes: Axes, term: str, pairs: Sequence[tuple[int, float]]) -> None:
+def running_mean(pairs: Sequence[tuple[int, float]]) -> list[tuple[int, float]]:
+    """Return means over the last few logged values, at the step of the last; few values stay as they are."""
     steps, values = np.array(pairs).T
     window = max(1, min(_SMOOTHED, len(values) // 8))
     smooth = np.convolve(values, np.ones(window) / window, mode="valid")
+    return list(zip(steps[window - 1 :].tolist(), smooth.tolist(), strict=True))
+
+
+def _draw_term(axes: Axes, term: str, pairs: Sequence[tuple[int, float]]) -> None:
+    steps, values = np.array(pairs).T
+    smooth = running_mean(pairs)
     total = term == "total"
     (line,) = axes.plot(
-        steps[window - 1 :], smooth, label=term, color=INK if total else None, linewidth=2.0 if total else 1.3
+        *np.array(smooth).T, label=term, color=INK if total else None, linewidth=2.0 if total else 1.3
     )
-    if window > 1:
+    if len(smooth) < len(values):
         axes.plot(steps, values, color=line.get_color(), linewidth=0.6, alpha=0.18)

@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 from PIL import Image
+from scipy.spatial import QhullError
 
 from raytran.data.atomic import finished_folder, no_room
 from raytran.data.collate import collate_scenes
@@ -58,6 +59,10 @@ class ScenePictures(pl.Callback):
             if no_room(error) is None:
                 raise
             _log.warning("no pictures of step %d (%s): make room in %s", step, error.strerror, self._folder)
+            return
+        except (ValueError, ArithmeticError, QhullError) as error:
+            # Boxes without extent, say, early on: no reason to end a run.
+            _log.warning("no pictures of step %d: %s", step, str(error).splitlines()[0])
             return
         logged_at = step - 1  # where Lightning, which counts logged steps from 0, puts the scores
         for logger in trainer.loggers:

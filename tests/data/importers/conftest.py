@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A walk through a room that is not there: plain images, poses that turn about, one pinhole camera."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from .forms import Walk
+
+
+@pytest.fixture
+def walk(tmp_path: Path) -> Walk:
+    """Twelve level cameras 1.5 m up that turn about while they go; +z is up, units are metres."""
+    images = tmp_path / "walk" / "images"
+    images.mkdir(parents=True)
+    poses = np.tile(np.eye(4), (12, 1, 1))
+    for n, pose in enumerate(poses):
+        yaw, pitch = 0.5 * n, 0.2 * np.sin(n)
+        forward = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
+        right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+        pose[:3, 3] = [0.3 * n, 0.5 * np.cos(n), 1.5 + 0.05 * np.sin(2 * n)]
+        # Grey 20 n, so that a frame tells its number; names do not sort as text.
+        Image.new("RGB", (64, 48), (20 * n,) * 3).save(images / f"{n}.png")
+    return Walk(
+        images.parent, tuple(f"{n}.png" for n in range(12)), poses, (48, 64), (50.0, 51.0, 31.0, 25.0)
+    )

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Writers of the formats that phones and reconstruction programs write."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+MODEL_NUMBERS = {"PINHOLE": 1, "SIMPLE_RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 5, "FULL_OPENCV": 6}
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A folder with ``images/``, and what is known of them: poses are OpenCV, camera is fx, fy, cx, cy."""
+
+    folder: Path
+    names: tuple[str, ...]
+    poses: np.ndarray
+    image_size: tuple[int, int]
+    camera: tuple[float, float, float, float]
+
+
+def write_colmap(
+    walk: Walk, folder: Path, *, binary: bool, model: str = "PINHOLE", parameters=None, cameras=1
+) -> None:
+    """Write ``cameras`` and ``images`` as COLMAP does, with two observed points per image."""
+    folder.mkdir(parents=True)
+    parameters = list(walk.camera) if parameters is None else list(parameters)
+    height, width = walk.image_size
+    inverse = np.linalg.inv(walk.poses)
+    quaternions = Rotation.from_matrix(inverse[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
+    lens = [(number + 1, model, width, height, parameters) for number in range(cameras)]
+    # COLMAP numbers images as it registers them, not as they are named.
+    images = [
+        (i + 1, quaternions[n], inverse[n, :3, 3], 1 + n % cameras, walk.names[n])
+        for i, n in enumerate(reversed(range(len(walk.names))))
+    ]
+    if not binary:
+        rows = ["# Camera list"] + [f"{c[0]} {c[1]} {c[2]} {c[3]} {words(c[4])}" for c in lens]
+        (folder / "cameras.txt").write_text("\n".join(rows) + "\n")
+        rows = ["# Image list"]
+        for i, turn, shift, camera, name in images:
+            rows += [
+                f"{i} {words(turn)} {words(shift)} {camera} {name}",
+                "" if i == 2 else "1.5 2.5 -1 3.0 4.0 7",
+            ]
+        (folder / "images.txt").write_text("\n".join(rows) + "\n")
+        return
+    out = struct.pack("<Q", len(lens))
+    for number, name, w, h, values in lens:
+        out += struct.pack(f"<IiQQ{len(values)}d", number, MODEL_NUMBERS[name], w, h, *values)
+    (folder / "cameras.bin").write_bytes(out)
+    out = struct.pack("<Q", len(images))
+    for i, turn, shift, camera, name in images:
+        out += struct.pack("<I7dI", i, *turn, *shift, camera) + name.encode() + b"\0"
+        out += struct.pack("<Q", 2) + 2 * struct.pack("<ddq", 1.5, 2.5, -1)
+    (folder / "images.bin").write_bytes(out)
+
+
+def transforms(walk: Walk, **changes) -> dict:
+    """Return the content of a ``transforms.json``."""
+    fx, fy, cx, cy = walk.camera
+    frames = [
+        {"file_path": f"images/{name}", "transform_matrix": (pose @ OPENGL).tolist()}
+        for name, pose in zip(walk.names, walk.poses, strict=True)
+    ]
+    height, width = walk.image_size
+    facts = {"camera_model": "OPENCV", "w": width, "h": height, "fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy}
+    return facts | {"frames": frames[::-1]} | changes
+
+
+def write_transforms(walk: Walk, **changes) -> Path:
+    """Write a ``transforms.json`` beside ``images/``."""
+    path = walk.folder / "transforms.json"
+    path.write_text(json.dumps(transforms(walk, **changes)))
+    return path
+
+
+def words(values) -> str:
+    return " ".join(repr(float(value)) for value in values)

@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One scene in every form is one scene: the right reader is found, and what nobody knows is said."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from raytran.data.importers.open import FORMATS, open_scene
+from raytran.data.importers.orient import WorldSettings
+from raytran.errors import ConfigError, DataError
+
+from ..scan_forms import write_form
+from .forms import Walk, write_colmap, write_transforms
+
+BLIND = WorldSettings(check=False)
+
+
+@pytest.fixture
+def scannet(walk):
+    """The walk in the layout of ScanNet's exporter."""
+    folder = walk.folder.parent / "exported" / "walk"
+    (folder / "pose").mkdir(parents=True)
+    (folder / "intrinsic").mkdir()
+    (walk.folder / "images").rename(folder / "color")
+    (walk.folder / "images").symlink_to(folder / "color")
+    for n, pose in enumerate(walk.poses):
+        np.savetxt(folder / "pose" / f"{n}.txt", pose)
+    fx, fy, cx, cy = walk.camera
+    matrix = np.array([[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", matrix)
+    return folder
+
+
+def test_a_walk_is_the_same_in_every_form(walk, scannet):
+    forms = {"scannet": scannet, "colmap": walk.folder}
+    write_colmap(walk, walk.folder / "sparse" / "0", binary=True)
+    scans = {name: open_scene(path, settings=BLIND) for name, path in forms.items()}
+    scans["nerfstudio"] = open_scene(write_transforms(walk), settings=BLIND)
+    expected = scans["scannet"]
+    for scan in scans.values():
+        assert scan.scene_id == "walk"
+        assert scan.frame_id == expected.frame_id
+        np.testing.assert_allclose(scan.world_from_camera, expected.world_from_camera, atol=1e-9)
+        np.testing.assert_allclose(scan.intrinsics, expected.intrinsics, atol=1e-9)
+        assert np.array_equal(scan.read_color(9, (24, 32)), expected.read_color(9, (24, 32)))
+
+
+def test_the_format_may_be_named(walk, caplog):
+    write_colmap(walk, walk.folder / "sparse" / "0", binary=True)
+    write_transforms(walk)
+    caplog.set_level("INFO")
+    assert open_scene(walk.folder, settings=BLIND).path.name == "transforms.json"
+    assert "is there as nerfstudio, colmap: reading nerfstudio; format= chooses" in caplog.text
+    assert open_scene(walk.folder, format="colmap", settings=BLIND).path.name == "images.bin"
+
+
+def test_a_scan_of_scannet_comes_first(walk, scannet):
+    poses = Walk(scannet, walk.names, walk.poses, walk.image_size, walk.camera)
+    write_transforms(poses, frames=[])
+    assert open_scene(scannet, settings=BLIND).path == scannet
+
+
+@pytest.mark.parametrize("form", ["cpp", "odam", "mmdetection3d", "frames_25k"])
+def test_scannets_other_forms_are_recognised(walk, scannet, form, tmp_path):
+    write_form(form, scannet, tmp_path / form / "walk")
+    assert len(open_scene(tmp_path / form / "walk", settings=BLIND)) == 12
+
+
+def test_what_is_not_there_or_unknown(walk, tmp_path):
+    with pytest.raises(ConfigError, match=f"unknown format=kitti: choose one of {', '.join(FORMATS)}"):
+        open_scene(walk.folder, format="kitti")
+    with pytest.raises(DataError, match=r"there is no scene .*nowhere: check the path"):
+        open_scene(tmp_path / "nowhere")
+    with pytest.raises(DataError, match="holds the folder images, so no frames"):
+        open_scene(walk.folder)
+    (tmp_path / "notes.doc").write_text("")
+    with pytest.raises(DataError, match=r"notes\.doc is in none of the formats scannet, "):
+        open_scene(tmp_path / "notes.doc")

@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two processes, this file's own, against one. Rank 0 has a scene of two objects, rank 1 an empty one."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import lightning.pytorch as pl
+import pytest
+import torch
+from lightning.pytorch.strategies import DDPStrategy
+from torch import nn
+
+from raytran.data.collate import collate_scenes
+from raytran.run.build import build_model, build_module
+from raytran.run.entry import compose
+from raytran.training.callbacks.rank_agreement import RankAgreement
+from raytran.training.callbacks.stage_setup import StageSetup
+from raytran.training.ranks import BatchNormOverRanks, SyncedBatchNorm, agree, mean_over_ranks
+from raytran.types import ObjectSet
+
+STAGES = ("stage1", "stage2", "stage3")
+STEPS = 5
+SETTINGS = [
+    "preset=tiny",
+    "model.grid_resolution=[8,8,4]",
+    "model.heads.objects.num_queries=6",
+    "model.heads.objects.windowed=false",  # computes in float32, whatever it is given
+    "output_dir=unused",
+]
+
+
+@pytest.fixture
+def scenes(batch):
+    """The two scenes of a step."""
+    nothing = replace(ObjectSet.empty(), shape=torch.zeros(0, 63, 63, 63, dtype=torch.bool))
+    empty = replace(
+        batch, scene_id=("scene0001_00",), objects=(nothing,), occupancy=torch.zeros_like(batch.occupancy)
+    )
+    empty = replace(empty, views=replace(empty.views, images=255 - empty.views.images))
+    return tuple(scene._map(in_float64) for scene in (batch, empty))
+
+
+def in_float64(value):
+    """Return floating point tensors in float64: AdamW makes rounding errors of small gradients large."""
+    if isinstance(value, torch.Tensor):
+        return value.double() if value.is_floating_point() else value
+    return value._map(in_float64)
+
+
+@pytest.fixture
+def two_ranks(scenes, tmp_path):
+    """What two ranks say, one scene each."""
+    torch.save(scenes, tmp_path / "scenes.pt")
+    environment = os.environ | {
+        "OMP_NUM_THREADS": "1",
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": free_port(),
+    }
+    ranks = [
+        subprocess.Popen(
+            [sys.executable, __file__, str(tmp_path)],
+            env=environment | {"WORLD_SIZE": "2", "LOCAL_RANK": rank, "NODE_RANK": "0", "RANK": rank},
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for rank in "01"
+    ]
+    for rank in ranks:
+        _, stderr = rank.communicate(timeout=300)
+        assert rank.returncode == 0, stderr
+    return [torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in "01"]
+
+
+def free_port():
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        return str(listener.getsockname()[1])
+
+
+def fit(experiment, scene, **settings):
+    """Return the weights after a few steps on one batch, and what was left without a gradient."""
+    torch.manual_seed(0)
+    cfg = compose("train", [*SETTINGS, f"experiment={experiment}"])
+    module = build_module(cfg, build_model(cfg).double())
+    idle = IdleParameters()
+    trainer = pl.Trainer(
+        accelerator="cpu",
+        max_steps=STEPS,
+        gradient_clip_val=1.0,
+        callbacks=[StageSetup(), RankAgreement(), idle],
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        **settings,
+    )
+    trainer.fit(module, torch.utils.data.DataLoader([scene] * STEPS, batch_size=None))
+    return {"weights": module.state_dict(), "idle": sorted(idle.names)}
+
+
+class IdleParameters(pl.Callback):
+    """Remembers the parameters that train and got no gradient."""
+
+    def __init__(self):
+        self.names = set()
+
+    def on_before_optimizer_step(self, trainer, pl_module, optimizer):
+        self.names |= {n for n, p in pl_module.named_parameters() if p.requires_grad and p.grad is None}
+
+
+def normalize(images, norm):
+    """Return what a batch norm makes of images, its gradients, and its running statistics."""
+    images = images.clone().requires_grad_()
+    out = norm(images)
+    (out * torch.arange(out.numel()).view(out.shape).sin()).sum().backward()
+    return [out.detach(), images.grad, norm.weight.grad, norm.bias.grad, norm.running_mean, norm.running_var]
+
+
+def test_two_ranks_and_an_empty_scene_take_the_step_of_one_rank(scenes, two_ranks):
+    for stage in STAGES:
+        one = fit(stage, collate_scenes(scenes))
+        assert one["idle"] == two_ranks[0][stage]["idle"] == two_ranks[1][stage]["idle"] == []
+        for name, value in one["weights"].items():
+            first, second = (rank[stage]["weights"][name] for rank in two_ranks)
+            assert torch.equal(first, second), name
+            assert torch.allclose(first, value, rtol=0, atol=1e-12), (stage, name)
+    norm = nn.BatchNorm2d(3)
+    images = torch.randn(2, 3, 4, 5, generator=torch.Generator().manual_seed(0))
+    # Each rank weighs its outputs anew from the start: one process has to do the same.
+    whole = images.clone().requires_grad_()
+    out = norm(whole)
+    (out * torch.arange(60).view(1, 3, 4, 5).sin()).sum().backward()
+    for rank, found in enumerate(two_ranks):
+        here = slice(rank, rank + 1)
+        wanted = [out[here].detach(), whole.grad[here], None, None, norm.running_mean, norm.running_var]
+        for a, b in zip(found["norm"], wanted, strict=True):
+            if b is not None:
+                torch.testing.assert_close(a, b, rtol=0, atol=1e-5)
+    # Gradients of scale and shift are each rank's own: DistributedDataParallel adds them up.
+    both = [a + b for a, b in zip(two_ranks[0]["norm"][2:4], two_ranks[1]["norm"][2:4], strict=True)]
+    torch.testing.assert_close(both, [norm.weight.grad, norm.bias.grad], rtol=0, atol=1e-4)
+    for rank in two_ranks:
+        assert rank["mean"].tolist() == [0.5, 10.0]
+        assert (rank["same"], rank["last_bit"], rank["order"]) == (True, False, False)
+
+
+def test_one_rank_is_its_own_mean():
+    values = torch.tensor([1.0, 2.0])
+    assert mean_over_ranks(values) is values
+    assert agree([values], torch.device("cpu"))
+
+
+def test_batch_norm_is_exchanged_and_given_back():
+    model = nn.Sequential(nn.BatchNorm2d(3), nn.Sequential(nn.BatchNorm2d(2)))
+    for on_cpu, kind in ((True, BatchNormOverRanks), (False, nn.SyncBatchNorm)):
+        sync = SyncedBatchNorm(on_cpu=on_cpu)
+        changed = sync.apply(model)
+        assert [type(changed[0]), type(changed[1][0])] == [kind, kind]
+        given_back = sync.revert(changed)
+        assert not any(isinstance(m, kind) for m in given_back.modules())
+        assert list(given_back.state_dict()) == list(model.state_dict())
+
+
+def test_alone_the_batch_norm_is_pytorchs():
+    images = torch.randn(4, 3, 5, 6, generator=torch.Generator().manual_seed(0)).mul(3).add(1)
+    ours, theirs = BatchNormOverRanks(3), nn.BatchNorm2d(3)
+    for a, b in zip(normalize(images, ours), normalize(images, theirs), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(ours.eval()(images), theirs.eval()(images), rtol=1e-5, atol=1e-5)
+
+
+def run_rank(folder):
+    rank = int(os.environ["RANK"])
+    scene = torch.load(folder / "scenes.pt", weights_only=False)[rank]
+    found = {}
+    for stage in STAGES:
+        plugins = [SyncedBatchNorm(on_cpu=True)]
+        strategy = DDPStrategy(process_group_backend="gloo")
+        found[stage] = fit(stage, scene, devices=2, strategy=strategy, plugins=plugins)
+    images = torch.randn(2, 3, 4, 5, generator=torch.Generator().manual_seed(0))[rank : rank + 1]
+    found["norm"] = normalize(images, BatchNormOverRanks(3))
+    found["mean"] = mean_over_ranks(torch.tensor([float(rank), 10.0]))
+    here, values = torch.device("cpu"), [torch.arange(5.0), torch.ones(2).bfloat16(), torch.tensor(3)]
+    found["same"] = agree(values, here)
+    found["last_bit"] = agree([torch.tensor(1.0), torch.tensor(2.0 + rank * 2**-22)], here)
+    found["order"] = agree([torch.tensor([1.0, 2.0, 3.0]).roll(rank)], here)
+    torch.save(found, folder / f"{rank}.pt")
+
+
+if __name__ == "__main__":
+    run_rank(Path(sys.argv[1]))
