@@ -18,7 +18,7 @@ LAYERS: list[set[str]] = [
     {"export", "view"},
     {"training"},
     {"run"},
-    {"train", "curriculum", "evaluate", "predict", "prepare", "demo", "replay"},
+    {"train", "curriculum", "evaluate", "predict", "prepare", "demo", "replay", "report"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 NEEDS_TRAINING = {"lightning", "hydra", "wandb"}
