@@ -34,7 +34,13 @@ KILLS = int(os.environ.get("RAYTRAN_TEST_KILLS", "2"))
 @pytest.fixture(scope="module")
 def base(settings):
     short = [item for item in settings if not item.startswith(("trainer=", "schedule.log_every"))]
-    more = ["trainer.val_check_interval=9", "checkpoint_every=5", "schedule.log_every=2", "resume=auto"]
+    more = [
+        "trainer.val_check_interval=9",
+        "checkpoint_every=5",
+        "schedule.log_every=2",
+        "resume=auto",
+        "watch.pictures=0",
+    ]
     return [*short, *more, "progress_bar=none"]
 
 

@@ -136,13 +136,16 @@ class LastCheckpoint(pl.Callback):
         self._scores["step"] = trainer.global_step
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Write the final checkpoint.
+        """Write the final checkpoint."""
+        if trainer.global_step != self._written_at:
+            self._write(trainer)
+
+    def on_fit_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Let no run count as finished whose final checkpoint is missing; the ranks need no more each other.
 
         Raises:
-            CheckpointError: it cannot be written.
+            CheckpointError: it could not be written.
         """
-        if trainer.global_step != self._written_at or not self._path.is_file():
-            self._write(trainer)
         error = self._write_error(trainer)
         if error is not None:
             raise error
