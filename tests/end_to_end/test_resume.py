@@ -223,12 +223,13 @@ def test_a_full_disk_does_not_stop_a_run_that_has_steps_to_go(base, straight, tm
     assert_same(run, straight)
 
 
-def test_an_earlier_checkpoint_can_be_named(base, straight, tmp_path):
+def test_an_earlier_checkpoint_can_be_named(base, straight, tmp_path, caplog):
     run = tmp_path / "run"
     shutil.copytree(straight, run)
     (run / FINISHED).unlink()
     fit(base, run, f"resume={run / PREVIOUS}")
     assert_same(run, straight)
+    assert "another setting" not in caplog.text
 
 
 def test_two_processes_do_not_train_in_one_folder(base, tmp_path):
