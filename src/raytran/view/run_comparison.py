@@ -84,7 +84,7 @@ def write_run_comparison(path: Path, runs: Sequence[RunRecord], *, notes: Sequen
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    names = sorted({name for run in runs for name in run.history})
+    names = sorted({name for run in runs for name in run.history}, key=_place)
     per_class = [name for name in names if _is_score(name) and name.count("/") == 3]
     overall = [name for name in names if _is_score(name) and name not in per_class]
     differing, same = _settings(runs)
@@ -108,6 +108,13 @@ def final(history: History, name: str) -> float | None:
     """Return the last value logged under a name."""
     pairs = history.get(name)
     return pairs[-1][1] if pairs else None
+
+
+def _place(name: str) -> tuple[int, str]:
+    """Return a sort key: objects before the tasks that help to find them."""
+    tasks = ("objects", "occupancy", "foreground")
+    task = name.split("/")[1] if "/" in name else ""
+    return (tasks.index(task) if task in tasks else len(tasks), name)
 
 
 def _is_score(name: str) -> bool:
@@ -148,22 +155,26 @@ def _charts(title: str, names: Sequence[str], runs: Sequence[RunRecord]) -> list
     chosen = [name for name in names if name.startswith(prefix) and "/layer" not in name]
     if scores is not None:
         chosen = [name for name in chosen if _is_score(name) == scores and name.count("/") < 3]
-    chosen.sort(key=lambda name: (name.split("/")[-1] not in ("total", "all"), name))
-    return [(name, _chart(name, runs, smooth=not scores, log=name.startswith("train/"))) for name in chosen]
+    chosen.sort(key=lambda name: name.split("/")[-1] not in ("total", "all"))
+    return [(name, _chart(name, runs, smooth=not scores)) for name in chosen]
 
 
-def _chart(name: str, runs: Sequence[RunRecord], *, smooth: bool, log: bool) -> str:
+def _chart(name: str, runs: Sequence[RunRecord], *, smooth: bool) -> str:
     # Small and sharp at any size; text stays text, in the reader's own typeface.
     with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "raytran", "font.family": "sans-serif"}):
-        figure = Figure(figsize=(4.2, 2.5), layout="constrained")
+        figure = Figure(figsize=(3.4, 2.1), layout="constrained")
         axes = figure.add_subplot()
         lowest = math.inf
         for i, run in enumerate(runs):
             if pairs := [pair for pair in run.history.get(name, ()) if math.isfinite(pair[1])]:
                 _draw(axes, pairs, i, smooth=smooth)
                 lowest = min([lowest, *(value for _, value in pairs)])
-        if log and lowest > 0:
+        if name.startswith("train/") and lowest > 0:
             axes.set_yscale("log")
+        elif lowest >= 0 and (_is_score(name) or name.startswith("health/")):
+            # From zero, so that heights mean something; the line of a score of zero stays visible.
+            top = axes.get_ylim()[1] if lowest < math.inf else 1.0
+            axes.set_ylim(-0.03 * top, max(top, 0.1))
         axes.set_xlabel("step", color=FAINT, fontsize=8)
         axes.margins(x=0.02)
         axes.tick_params(colors=FAINT, labelsize=8, which="both")
