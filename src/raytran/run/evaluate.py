@@ -23,7 +23,7 @@ from raytran.metrics.curves import accuracy_by_scene_size
 from raytran.metrics.records import Row
 from raytran.model import RayTran
 from raytran.run.build import build_data
-from raytran.run.checkpoint import load_model, prediction_settings
+from raytran.run.checkpoint import PredictionSettings, load_model, prediction_settings
 from raytran.run.device import choose_device
 from raytran.run.entry import compose
 from raytran.run.output import check_replaceable, replaced_folder
@@ -61,16 +61,9 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     if not any(item.startswith("preset=") for item in overrides):
         cfg = compose("evaluate", [*overrides, f"preset={settings.preset}"])
     cfg.split = cfg.split or "val"
-    # The checkpoint, not the preset, says which images and which grid its model was made for.
-    cfg.views.image_size = list(settings.image_size)
-    cfg.views.num_views = cfg.num_views or settings.num_views
     # The stages before it leave the shape head untrained.
     tasks = TASKS_WITH_SHAPE if settings.stage == "shape" else TASKS
-    if "shape" in tasks:
-        cfg.stage.targets = [*cfg.stage.targets, "shapes"]
-    # A model that was trained with the true masks as a fourth channel gets them here.
-    cfg.data.dataset.input_mask = model.backbone.resnet.input_channels == 4
-    cfg.model.grid_resolution, cfg.model.grid_extent = list(model.grid_resolution), list(model.grid_extent)
+    _make_data_fit(cfg, settings, model, tasks)
     data = build_data(cfg)
     data.prepare_data()
     metrics = evaluate_model(
@@ -90,6 +83,19 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     Console().print(metrics_table(metrics, title=f"{settings.preset}, {cfg.split} scenes of {data.root}"))
     _log.info("wrote %s: metrics.json, per_scene.csv, per_object.csv", output.resolve())
     return metrics
+
+
+def _make_data_fit(
+    cfg: DictConfig, settings: PredictionSettings, model: RayTran, tasks: Collection[str]
+) -> None:
+    """Ask for the data that a model wants: the checkpoint, not the preset, says which it was made for."""
+    cfg.views.image_size = list(settings.image_size)
+    cfg.views.num_views = cfg.num_views or settings.num_views
+    if "shape" in tasks:
+        cfg.stage.targets = [*cfg.stage.targets, "shapes"]
+    cfg.model.grid_resolution, cfg.model.grid_extent = list(model.grid_resolution), list(model.grid_extent)
+    # One that was trained with the true masks as a fourth channel gets them here.
+    cfg.data.dataset.input_mask = model.backbone.resnet.input_channels == 4
 
 
 def with_at_most(max_objects: int | None, dataset: Any) -> Dataset[SceneBatch]:
