@@ -19,6 +19,7 @@ from pathlib import Path
 from omegaconf import OmegaConf
 
 from raytran.errors import CheckpointError, ConfigError
+from raytran.run.launched import first_ranks, name_by_time
 
 _log = logging.getLogger(__name__)
 
@@ -163,9 +164,13 @@ def run_folder(outputs: str, preset: str, experiment: str, resume: str, holds: s
                 "give resume=auto, or init_from=CHECKPOINT to start a new run from its weights"
             )
         return str(checkpoint.parent.parent)
-    return str(parent / datetime.now().strftime("%Y-%m-%d_%H-%M-%S"))
+    return str(parent / name_by_time())
 
 
 def register_resolvers() -> None:
-    """Make ``${run_folder:…}`` known to the configs; evaluated once per command."""
-    OmegaConf.register_new_resolver("run_folder", run_folder, use_cache=True, replace=True)
+    """Make ``${run_folder:…}`` known to the configs; evaluated once per command, by the first rank."""
+
+    def resolve(*arguments: str) -> str:
+        return first_ranks(f"the folder of {' '.join(arguments)}", lambda: run_folder(*arguments))
+
+    OmegaConf.register_new_resolver("run_folder", resolve, use_cache=True, replace=True)
