@@ -51,8 +51,10 @@ class Finished:
 
 
 @contextmanager
-def one_at_a_time(folder: Path) -> Iterator[None]:
+def one_at_a_time(folder: Path) -> Iterator[int]:
     """Keep other processes from training in ``folder`` until the block ends or this process is killed.
+
+    Gives the descriptor of the lock. A process that inherits it keeps the folder too.
 
     Raises:
         ConfigError: one does already.
@@ -70,7 +72,7 @@ def one_at_a_time(folder: Path) -> Iterator[None]:
         except (ImportError, OSError) as error:
             # Windows, and some network disks: there it is for the user not to start two.
             _log.debug("cannot lock %s: %s", folder, error)
-        yield
+        yield file.fileno()
 
 
 def write_finished(folder: Path, *, stage: str, preset: str, experiment: str, steps: int) -> Finished:
