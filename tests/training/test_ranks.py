@@ -125,6 +125,7 @@ def normalize(images, norm):
     return [out.detach(), images.grad, norm.weight.grad, norm.bias.grad, norm.running_mean, norm.running_var]
 
 
+@pytest.mark.slow
 def test_two_ranks_and_an_empty_scene_take_the_step_of_one_rank(scenes, two_ranks):
     for stage in STAGES:
         one = fit(stage, [collate_scenes(step) for step in scenes])

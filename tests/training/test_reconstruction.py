@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import lightning.pytorch as pl
 import pytest
@@ -57,3 +58,36 @@ def test_a_scene_without_objects_trains(experiment, batch, make_module):
     empty = replace(ObjectSet.empty(), shape=torch.zeros(0, 63, 63, 63, dtype=torch.bool))
     trainer = fit(make_module(experiment), replace(batch, objects=(empty,)), max_steps=1)
     assert torch.isfinite(trainer.logged_metrics["train/total"])
+
+
+def test_a_validation_scene_that_comes_twice_counts_once(batch, make_module):
+    """On two ranks of three scenes the last of the second rank is the first scene again."""
+    module = make_module("stage2")
+    loader = torch.utils.data.DataLoader([batch] * 3, batch_size=None)
+    module.trainer = SimpleNamespace(world_size=2, global_rank=1, val_dataloaders=loader)
+    assert [module._is_repeated(index) for index in range(2)] == [False, True]
+    module.trainer.global_rank = 0
+    assert [module._is_repeated(index) for index in range(2)] == [False, False]
+
+
+def test_validation_does_not_depend_on_what_comes_twice(batch, make_module, monkeypatch):
+    module = make_module("stage2")
+    other = replace(batch, occupancy=~batch.occupancy, scene_id=("other",))
+    once = validate(module, [batch, other])
+    monkeypatch.setattr(type(module), "_is_repeated", lambda _, index: index == 2)
+    assert validate(module, [batch, other, batch]) == once
+    assert validate(module, [batch, other, other]) == once
+    monkeypatch.undo()
+    assert validate(module, [batch, other, other]) != once
+
+
+def validate(module, batches):
+    trainer = pl.Trainer(
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    loader = torch.utils.data.DataLoader(batches, batch_size=None)
+    return trainer.validate(module, loader, verbose=False)
