@@ -190,6 +190,7 @@ def _quiet() -> None:
         ".*in eval mode at the start of training.*",
         ".*isinstance.treespec, LeafSpec.*",
         ".*smaller than the logging interval.*",
+        "Grad strides do not match bucket view strides.*",  # of a convolution to one channel
         ".*recommended to use .*sync_dist=True.*",  # the metrics have gathered over the ranks themselves
     ):
         warnings.filterwarnings("ignore", message=pattern)
