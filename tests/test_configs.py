@@ -117,7 +117,7 @@ def test_the_papers_preset_is_the_default_of_the_code():
 
 
 def test_the_papers_numbers():
-    config = train_config("preset=raytran", "trainer=ddp", "experiment=stage2")
+    config = train_config("preset=raytran", "trainer=ddp", "precision=16-mixed", "experiment=stage2")
     assert [config.schedule[stage].steps for stage in ("occupancy", "joint", "shape")] == [
         224000,
         239000,
@@ -127,7 +127,7 @@ def test_the_papers_numbers():
     assert config.optimizer.weight_decay == 5e-2
     assert config.trainer.gradient_clip_val == 0.1
     assert config.trainer.precision == "16-mixed"
-    assert config.trainer.devices * config.data.batch_size == 8
+    assert config.trainer.devices * config.data.batch_size == config.schedule.batch == 8
     assert list(config.views.image_size) == [480, 640]
     assert (config.views.num_views, config.views.predict_views) == (20, 96)
     assert list(config.model.grid_resolution) == [48, 48, 16]

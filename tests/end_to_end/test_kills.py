@@ -34,7 +34,13 @@ KILLS = int(os.environ.get("RAYTRAN_TEST_KILLS", "2"))
 @pytest.fixture(scope="module")
 def base(settings):
     short = [item for item in settings if not item.startswith(("trainer=", "schedule.log_every"))]
-    more = ["trainer.val_check_interval=9", "checkpoint_every=5", "schedule.log_every=2", "resume=auto"]
+    more = [
+        "trainer.val_check_interval=9",
+        "checkpoint_every=5",
+        "schedule.log_every=2",
+        "resume=auto",
+        "watch.pictures=0",
+    ]
     return [*short, *more, "progress_bar=none"]
 
 
@@ -131,23 +137,23 @@ def child_of(pid):
 
 
 def test_a_curriculum_on_two_ranks_goes_on_after_a_signal_and_a_kill(base, tmp_path):
-    arguments = [*base, "trainer=ddp_cpu", "stages=[stage1,stage2]", "trainer.max_steps=20"]
+    arguments = [*base, "trainer=ddp_cpu", "trainer.max_steps=20"]
     straight, folder = tmp_path / "straight", tmp_path / "killed"
-    finish("curriculum", straight, *arguments)
+    finish("train", straight, *arguments)
+    arguments.append("stages=[stage1]")
+    stage = folder / "stage1"
 
     # A signal to the second rank alone: both stop after the same step and have saved it.
     process = start("curriculum", folder, *arguments)
-    wait_for_rows(process, folder / "stage1" / "metrics.csv", 2)
+    wait_for_rows(process, stage / "metrics.csv", 2)
     os.kill(child_of(child_of(process.pid)), signal.SIGUSR1)
     assert process.wait() == 1  # the curriculum's: its stage stopped
     text = folder.with_suffix(".log").read_text()
     assert f"stopped with exit code {128 + signal.SIGUSR1}" in text
-    assert f"continues from step {last_step(folder / 'stage1')}" in text
+    assert f"continues from step {last_step(stage)}" in text
 
     process = start("curriculum", folder, *arguments)
-    assert wait_and_kill(process, folder / "stage2" / "metrics.csv", 4, 0.0) == -signal.SIGKILL
-    first = (folder / "stage1" / LAST).read_bytes()
+    assert wait_and_kill(process, stage / "metrics.csv", 2, 0.0) == -signal.SIGKILL
+    assert 0 < last_step(stage) < 20
     finish("curriculum", folder, *arguments)
-    assert (folder / "stage1" / LAST).read_bytes() == first
-    for stage in ("stage1", "stage2"):
-        assert_same(folder / stage, straight / stage)
+    assert_same(stage, straight)

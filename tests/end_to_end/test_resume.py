@@ -7,6 +7,7 @@ import csv
 import errno
 import os
 import random
+import shutil
 import signal
 
 import numpy as np
@@ -15,7 +16,7 @@ import torch
 
 from raytran.errors import CheckpointError, ConfigError
 from raytran.run.entry import compose
-from raytran.run.folders import FINISHED, LAST, one_at_a_time
+from raytran.run.folders import FINISHED, LAST, PREVIOUS, one_at_a_time
 from raytran.run.train import train
 from raytran.training.reconstruction import Reconstruction
 
@@ -29,7 +30,13 @@ class Killed(BaseException):
 @pytest.fixture(scope="module")
 def base(settings):
     """Validation after steps 3 and 6; checkpoints after 2, 4, 6."""
-    return [*settings, f"trainer.max_steps={STEPS}", "trainer.val_check_interval=3", "checkpoint_every=2"]
+    return [
+        *settings,
+        f"trainer.max_steps={STEPS}",
+        "watch.pictures=0",
+        "trainer.val_check_interval=3",
+        "checkpoint_every=2",
+    ]
 
 
 def fit(base, folder, *more):
@@ -214,6 +221,15 @@ def test_a_full_disk_does_not_stop_a_run_that_has_steps_to_go(base, straight, tm
     full = set()
     fit(base, run)
     assert_same(run, straight)
+
+
+def test_an_earlier_checkpoint_can_be_named(base, straight, tmp_path, caplog):
+    run = tmp_path / "run"
+    shutil.copytree(straight, run)
+    (run / FINISHED).unlink()
+    fit(base, run, f"resume={run / PREVIOUS}")
+    assert_same(run, straight)
+    assert "another setting" not in caplog.text
 
 
 def test_two_processes_do_not_train_in_one_folder(base, tmp_path):

@@ -7,7 +7,7 @@ import pytest
 
 from raytran.run.build import build_model, build_module
 from raytran.run.entry import compose
-from raytran.run.start_report import start_report
+from raytran.run.start_report import changed_settings, start_report
 
 
 @pytest.mark.parametrize(
@@ -40,3 +40,19 @@ def test_the_parent_is_named_with_its_score():
     parent = {"path": "a/last.ckpt", "stage": "occupancy", "step": 1500, "scores": scores}
     last = start_report(module.stage, module.model, parent)[-1]
     assert last == "starts from stage occupancy, step 1500, val/occupancy/iou 0.412: a/last.ckpt"
+
+
+def test_settings_that_change_in_a_resumed_run_are_named():
+    before = {
+        "seed": 0,
+        "resume": "none",
+        "optimizer": {"learning_rate": 1e-3, "decay": "none"},
+        "views": [3, 4],
+    }
+    now = {"seed": 0, "resume": "auto", "optimizer": {"learning_rate": 1e-4, "warmup": 5}, "views": [3, 4]}
+    assert changed_settings(before, before) == []
+    assert changed_settings(before, now) == [
+        "optimizer.learning_rate: 0.001 → 0.0001",
+        "optimizer.decay: none → unset",
+        "optimizer.warmup: unset → 5",
+    ]

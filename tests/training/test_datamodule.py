@@ -91,3 +91,10 @@ def test_data_are_made_where_they_are_read(monkeypatch, tmp_path):
     made = []
     make_data(monkeypatch, tmp_path, make=lambda output: made.append(output)).prepare_data()
     assert made == [tmp_path]
+
+
+def test_validation_scenes_come_one_by_one(monkeypatch, tmp_path):
+    """So that losses, means over scenes, are the same for any batch size and any number of ranks."""
+    assert list(make_data(monkeypatch, tmp_path, batch_size=2).val_dataloader()) == [
+        [(0, i)] for i in range(5)
+    ]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two processes, this file's own, against one. Rank 0 has a scene of two objects, rank 1 an empty one."""
+"""Two processes, this file's own, against one. In every second step one of the scenes is empty."""
 
 from __future__ import annotations
 
@@ -37,13 +37,15 @@ SETTINGS = [
 
 @pytest.fixture
 def scenes(batch):
-    """The two scenes of a step."""
+    """The scenes of two steps, two each: of two objects and none, of two and one."""
     nothing = replace(ObjectSet.empty(), shape=torch.zeros(0, 63, 63, 63, dtype=torch.bool))
     empty = replace(
         batch, scene_id=("scene0001_00",), objects=(nothing,), occupancy=torch.zeros_like(batch.occupancy)
     )
     empty = replace(empty, views=replace(empty.views, images=255 - empty.views.images))
-    return tuple(scene._map(in_float64) for scene in (batch, empty))
+    other = replace(batch, objects=(batch.objects[0].select(torch.tensor([1])),))
+    other = replace(other, views=replace(other.views, images=batch.views.images.flip(-1)))
+    return [[scene._map(in_float64) for scene in step] for step in ((batch, empty), (batch, other))]
 
 
 def in_float64(value):
@@ -83,8 +85,8 @@ def free_port():
         return str(listener.getsockname()[1])
 
 
-def fit(experiment, scene, **settings):
-    """Return the weights after a few steps on one batch, and what was left without a gradient."""
+def fit(experiment, batches, **settings):
+    """Return the weights after a few steps, and what was left without a gradient."""
     torch.manual_seed(0)
     cfg = compose("train", [*SETTINGS, f"experiment={experiment}"])
     module = build_module(cfg, build_model(cfg).double())
@@ -101,7 +103,7 @@ def fit(experiment, scene, **settings):
         use_distributed_sampler=False,
         **settings,
     )
-    trainer.fit(module, torch.utils.data.DataLoader([scene] * STEPS, batch_size=None))
+    trainer.fit(module, torch.utils.data.DataLoader((batches * STEPS)[:STEPS], batch_size=None))
     return {"weights": module.state_dict(), "idle": sorted(idle.names)}
 
 
@@ -123,14 +125,15 @@ def normalize(images, norm):
     return [out.detach(), images.grad, norm.weight.grad, norm.bias.grad, norm.running_mean, norm.running_var]
 
 
+@pytest.mark.slow
 def test_two_ranks_and_an_empty_scene_take_the_step_of_one_rank(scenes, two_ranks):
     for stage in STAGES:
-        one = fit(stage, collate_scenes(scenes))
+        one = fit(stage, [collate_scenes(step) for step in scenes])
         assert one["idle"] == two_ranks[0][stage]["idle"] == two_ranks[1][stage]["idle"] == []
         for name, value in one["weights"].items():
             first, second = (rank[stage]["weights"][name] for rank in two_ranks)
             assert torch.equal(first, second), name
-            assert torch.allclose(first, value, rtol=0, atol=1e-12), (stage, name)
+            assert torch.allclose(first, value, rtol=0, atol=1e-10), (stage, name)
     norm = nn.BatchNorm2d(3)
     images = torch.randn(2, 3, 4, 5, generator=torch.Generator().manual_seed(0))
     # Each rank weighs its outputs anew from the start: one process has to do the same.
@@ -178,12 +181,12 @@ def test_alone_the_batch_norm_is_pytorchs():
 
 def run_rank(folder):
     rank = int(os.environ["RANK"])
-    scene = torch.load(folder / "scenes.pt", weights_only=False)[rank]
+    batches = [step[rank] for step in torch.load(folder / "scenes.pt", weights_only=False)]
     found = {}
     for stage in STAGES:
         plugins = [SyncedBatchNorm(on_cpu=True)]
         strategy = DDPStrategy(process_group_backend="gloo")
-        found[stage] = fit(stage, scene, devices=2, strategy=strategy, plugins=plugins)
+        found[stage] = fit(stage, batches, devices=2, strategy=strategy, plugins=plugins)
     images = torch.randn(2, 3, 4, 5, generator=torch.Generator().manual_seed(0))[rank : rank + 1]
     found["norm"] = normalize(images, BatchNormOverRanks(3))
     found["mean"] = mean_over_ranks(torch.tensor([float(rank), 10.0]))

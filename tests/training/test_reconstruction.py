@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import lightning.pytorch as pl
 import pytest
@@ -72,3 +73,36 @@ def test_compiled_or_not_the_loss_and_the_names_of_the_weights_are_the_same(batc
     torch.testing.assert_close(losses[0], losses[1])
     for name, weight in plain.state_dict().items():
         torch.testing.assert_close(weight, compiled.state_dict()[name], msg=name)
+
+
+def test_a_validation_scene_that_comes_twice_counts_once(batch, make_module):
+    """On two ranks of three scenes the last of the second rank is the first scene again."""
+    module = make_module("stage2")
+    loader = torch.utils.data.DataLoader([batch] * 3, batch_size=None)
+    module.trainer = SimpleNamespace(world_size=2, global_rank=1, val_dataloaders=loader)
+    assert [module._is_repeated(index) for index in range(2)] == [False, True]
+    module.trainer.global_rank = 0
+    assert [module._is_repeated(index) for index in range(2)] == [False, False]
+
+
+def test_validation_does_not_depend_on_what_comes_twice(batch, make_module, monkeypatch):
+    module = make_module("stage2")
+    other = replace(batch, occupancy=~batch.occupancy, scene_id=("other",))
+    once = validate(module, [batch, other])
+    monkeypatch.setattr(type(module), "_is_repeated", lambda _, index: index == 2)
+    assert validate(module, [batch, other, batch]) == once
+    assert validate(module, [batch, other, other]) == once
+    monkeypatch.undo()
+    assert validate(module, [batch, other, other]) != once
+
+
+def validate(module, batches):
+    trainer = pl.Trainer(
+        accelerator="cpu",
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    loader = torch.utils.data.DataLoader(batches, batch_size=None)
+    return trainer.validate(module, loader, verbose=False)

@@ -12,6 +12,7 @@ from hydra.utils import instantiate
 from lightning.pytorch.callbacks import TQDMProgressBar
 from omegaconf import DictConfig, OmegaConf
 
+from raytran.errors import ConfigError
 from raytran.run.folders import LAST
 from raytran.run.loggers import METRICS
 from raytran.run.settings import RunConfig
@@ -29,6 +30,8 @@ from raytran.training.reconstruction import Reconstruction
 
 if TYPE_CHECKING:
     from raytran.model import RayTran
+
+PRECISIONS = ("auto", "bf16-mixed", "16-mixed", "32-true")
 
 
 def plain(node: Any) -> Any:
@@ -65,8 +68,17 @@ def build_data(cfg: DictConfig) -> SceneDataModule:
     return instantiate(cfg.data, _convert_="all")
 
 
-def choose_precision(*, on_cpu: bool) -> str:
-    """Return bf16-mixed on GPUs that compute with it, 16-mixed on older ones, 32-true on the CPU."""
+def choose_precision(precision: str, *, on_cpu: bool) -> str:
+    """Return what ``auto`` means: bf16-mixed on GPUs that compute with it, 16-mixed on others, else 32-true.
+
+    Raises:
+        ConfigError: there is no such precision, or none on a CPU.
+    """
+    if precision not in PRECISIONS or (on_cpu and precision == "16-mixed"):
+        choices = [name for name in PRECISIONS if not (on_cpu and name == "16-mixed")]
+        raise ConfigError(f"unknown precision={precision} here: choose one of {', '.join(choices)}")
+    if precision != "auto":
+        return precision
     if on_cpu:
         return "32-true"
     return "bf16-mixed" if torch.cuda.is_bf16_supported(including_emulation=False) else "16-mixed"
@@ -82,8 +94,9 @@ def build_trainer(cfg: DictConfig, run: RunConfig, card: dict[str, Any]) -> pl.T
     """
     settings = plain(cfg.trainer)
     on_cpu = settings["accelerator"] == "cpu" or not torch.cuda.is_available()
-    if settings["precision"] == "auto":
-        settings["precision"] = choose_precision(on_cpu=on_cpu)
+    settings["precision"] = choose_precision(str(settings["precision"]), on_cpu=on_cpu)
+    # Lightning counts batches here, and the configs steps.
+    settings["val_check_interval"] *= settings["accumulate_grad_batches"]
     folder = Path(run.output_dir)
     callbacks: list[pl.Callback] = [
         StageSetup(),

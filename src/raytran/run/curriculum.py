@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 
 from raytran.data.atomic import write_json
 from raytran.errors import ConfigError, RaytranError
-from raytran.run.entry import compose
+from raytran.run.entry import compose, quoted, user_environment
 from raytran.run.folders import LAST, read_finished, write_finished
 from raytran.run.train import FitResult, train
 from raytran.training.callbacks.stop_signals import SIGNALS
@@ -61,9 +61,9 @@ def run_curriculum(
     for number, experiment in enumerate(stages, start=1):
         _log.info("stage %d of %d: experiment=%s", number, len(stages), experiment)
         folder = output_dir / experiment
-        settings = [*overrides, f"experiment={experiment}", f"output_dir={_quoted(folder)}", "resume=auto"]
+        settings = [*overrides, f"experiment={experiment}", f"output_dir={quoted(folder)}", "resume=auto"]
         if results:
-            settings.append(f"init_from={_quoted(results[-1].checkpoint)}")
+            settings.append(f"init_from={quoted(results[-1].checkpoint)}")
         results.append(_fit(settings, folder))
     write_finished(
         output_dir,
@@ -98,7 +98,7 @@ def _fit(settings: Sequence[str], folder: Path) -> FitResult:
 def _run(command: Sequence[str]) -> int:
     """Run a command and return its exit code; pass signals to stop on to it, and stop after it."""
     stopped_by = 0
-    with subprocess.Popen(command) as process:
+    with subprocess.Popen(command, env=user_environment()) as process:
 
         def pass_on(signum: int, frame: FrameType | None) -> None:
             nonlocal stopped_by
@@ -142,9 +142,3 @@ def _read_record(path: Path) -> dict[str, Any]:
 
 def _preset(overrides: Sequence[str]) -> str:
     return str(compose("train", [*overrides, "output_dir=none"]).preset)
-
-
-def _quoted(path: Path) -> str:
-    """Return a path as Hydra's override grammar wants it."""
-    escaped = str(path).replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'

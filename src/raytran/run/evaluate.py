@@ -63,7 +63,7 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     cfg.split = cfg.split or "val"
     # The stages before it leave the shape head untrained.
     tasks = TASKS_WITH_SHAPE if settings.stage == "shape" else TASKS
-    _ask_for_data(cfg, model, settings, shapes="shape" in tasks)
+    _make_data_fit(cfg, settings, model, tasks)
     data = build_data(cfg)
     data.prepare_data()
     metrics = evaluate_model(
@@ -86,15 +86,17 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     return metrics
 
 
-def _ask_for_data(cfg: DictConfig, model: RayTran, settings: PredictionSettings, *, shapes: bool) -> None:
-    """Set the images, grid and targets: the checkpoint, not the preset, says what its model was made for."""
+def _make_data_fit(
+    cfg: DictConfig, settings: PredictionSettings, model: RayTran, tasks: Collection[str]
+) -> None:
+    """Ask for the data that a model wants: the checkpoint, not the preset, says which it was made for."""
     cfg.views.image_size = list(settings.image_size)
     cfg.views.num_views = cfg.num_views or settings.num_views
-    if shapes:
+    if "shape" in tasks:
         cfg.stage.targets = [*cfg.stage.targets, "shapes"]
-    # A model that was trained with the true masks as a fourth channel gets them here.
-    cfg.data.dataset.input_mask = model.backbone.resnet.input_channels == 4
     cfg.model.grid_resolution, cfg.model.grid_extent = list(model.grid_resolution), list(model.grid_extent)
+    # One that was trained with the true masks as a fourth channel gets them here.
+    cfg.data.dataset.input_mask = model.backbone.resnet.input_channels == 4
 
 
 def with_at_most(max_objects: int | None, dataset: Any) -> Dataset[SceneBatch]:

@@ -19,6 +19,7 @@ from pathlib import Path
 from omegaconf import OmegaConf
 
 from raytran.errors import CheckpointError, ConfigError
+from raytran.run.launched import first_ranks, name_by_time
 
 _log = logging.getLogger(__name__)
 
@@ -50,8 +51,10 @@ class Finished:
 
 
 @contextmanager
-def one_at_a_time(folder: Path) -> Iterator[None]:
+def one_at_a_time(folder: Path) -> Iterator[int]:
     """Keep other processes from training in ``folder`` until the block ends or this process is killed.
+
+    Gives the descriptor of the lock. A process that inherits it keeps the folder too.
 
     Raises:
         ConfigError: one does already.
@@ -69,7 +72,7 @@ def one_at_a_time(folder: Path) -> Iterator[None]:
         except (ImportError, OSError) as error:
             # Windows, and some network disks: there it is for the user not to start two.
             _log.debug("cannot lock %s: %s", folder, error)
-        yield
+        yield file.fileno()
 
 
 def write_finished(folder: Path, *, stage: str, preset: str, experiment: str, steps: int) -> Finished:
@@ -163,9 +166,13 @@ def run_folder(outputs: str, preset: str, experiment: str, resume: str, holds: s
                 "give resume=auto, or init_from=CHECKPOINT to start a new run from its weights"
             )
         return str(checkpoint.parent.parent)
-    return str(parent / datetime.now().strftime("%Y-%m-%d_%H-%M-%S"))
+    return str(parent / name_by_time())
 
 
 def register_resolvers() -> None:
-    """Make ``${run_folder:…}`` known to the configs; evaluated once per command."""
-    OmegaConf.register_new_resolver("run_folder", run_folder, use_cache=True, replace=True)
+    """Make ``${run_folder:…}`` known to the configs; evaluated once per command, by the first rank."""
+
+    def resolve(*arguments: str) -> str:
+        return first_ranks(f"the folder of {' '.join(arguments)}", lambda: run_folder(*arguments))
+
+    OmegaConf.register_new_resolver("run_folder", resolve, use_cache=True, replace=True)

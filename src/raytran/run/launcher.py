@@ -7,11 +7,9 @@ Lightning takes the next job for a part of the first.
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 from hydra.core.config_loader import ConfigLoader
@@ -19,13 +17,13 @@ from hydra.core.utils import JobReturn, JobStatus, configure_log
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from raytran.errors import ConfigError, RaytranError
+from raytran.run.folders import one_at_a_time
 from raytran.run.sweep_folder import RECORD, own_settings, read_record, write_record
 from raytran.run.sweep_jobs import CONSOLE, Job, JobPool
 from raytran.run.sweep_table import FINISHED, FINISHED_BEFORE, JobResult, report
 
 _log = logging.getLogger(__name__)
 
-_LOCK = "sweep.lock"
 _OF_SWEEPS = ("hydra.sweep", "hydra/sweep", "hydra.launcher", "hydra/launcher", "hydra.mode", "hydra.run.dir")
 """Settings of Hydra that are not for a single job."""
 
@@ -54,7 +52,8 @@ def launch(
     """
     configure_log(config.hydra.hydra_logging, config.hydra.verbose)
     folder = Path(config.hydra.sweep.dir).absolute()
-    with sweep_lock(folder) as lock:
+    # The jobs inherit the lock: a sweep is not taken up again while a job of a killed launcher still trains.
+    with one_at_a_time(folder) as lock:
         jobs = _jobs(config, loader, job_overrides, folder)
         gpus = _gpus() if any(job.config.trainer.accelerator != "cpu" for job in jobs) else []
         pool = JobPool(_limit(parallel, jobs, gpus), gpus, _general(config), lock)
@@ -64,28 +63,6 @@ def launch(
         _log.info("stopped; the same command goes on with this sweep")
         raise SystemExit(128 + pool.stopped_by)
     return [_job_return(job, result) for job, result in zip(jobs, results, strict=True)]
-
-
-@contextmanager
-def sweep_lock(folder: Path) -> Iterator[int]:
-    """Keep other processes from running the same sweep; gives the descriptor that holds the lock.
-
-    A job that inherits it holds the lock too, so that a sweep is not taken up again while a job of a killed
-    launcher still trains.
-
-    Raises:
-        ConfigError: the sweep is running already.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / _LOCK).open("w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            raise ConfigError(
-                f"the sweep in {folder} is running already: wait for it, or start another with "
-                "launcher.resume=none"
-            ) from error
-        yield file.fileno()
 
 
 def _jobs(

@@ -3,11 +3,15 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import subprocess
+from collections import Counter
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+import torch
 
 import raytran
 
@@ -49,8 +53,24 @@ def versions() -> dict[str, str]:
 
 
 def provenance() -> dict[str, Any]:
-    """Return commit, versions and platform as plain Python."""
-    return {"git_commit": git_commit(), "versions": versions(), "platform": platform.platform()}
+    """Return commit, versions, platform and machine as plain Python."""
+    return {
+        "git_commit": git_commit(),
+        "versions": versions(),
+        "platform": platform.platform(),
+        "machine": machine(),
+    }
+
+
+def machine() -> str:
+    """Return what computes here, e.g. ``16 cores, 8 × NVIDIA A100``."""
+    cores = os.cpu_count() or 1
+    gpus = Counter(torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count()))
+    parts = [
+        f"{cores} core{'' if cores == 1 else 's'}",
+        *(f"{count} × {name}" for name, count in gpus.items()),
+    ]
+    return ", ".join(parts)
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

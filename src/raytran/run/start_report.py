@@ -3,11 +3,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from raytran.model import RayTran
 from raytran.training.stage import Stage
+
+_NOT_COMPUTED = {
+    *("output_dir", "outputs", "resume", "init_from", "check_parent", "progress_bar", "logger", "launcher"),
+    *("stages", "debug", "sweep", "watch", "optimized_metric"),
+}
+"""Top-level settings that say where and how a run goes on, not what it computes."""
 
 
 def start_report(stage: Stage, model: RayTran, parent: Mapping[str, Any] | None) -> list[str]:
@@ -38,6 +44,30 @@ def start_report(stage: Stage, model: RayTran, parent: Mapping[str, Any] | None)
         at = f"stage {parent['stage']}, step {parent['step']}"
         lines.append(f"starts from {', '.join([at, *told])}: {parent['path']}")
     return lines
+
+
+def changed_settings(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Return ``name: before → now`` for each setting that changes what a resumed run computes.
+
+    Args:
+        before: all settings of the run as its checkpoint has them.
+        now: those it is continued with.
+    """
+    old, new = (
+        dict(_leaves({name: value for name, value in settings.items() if name not in _NOT_COMPUTED}))
+        for settings in (before, now)
+    )
+    names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
+    return [f"{name}: {old.get(name, 'unset')} → {new.get(name, 'unset')}" for name in names]
+
+
+def _leaves(node: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield the dotted name and the value of every setting."""
+    if isinstance(node, Mapping):
+        for name, value in node.items():
+            yield from _leaves(value, f"{path}.{name}" if path else str(name))
+    else:
+        yield path, node
 
 
 def _part(name: str) -> str:

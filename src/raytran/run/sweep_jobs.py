@@ -123,7 +123,7 @@ class JobPool:
         limit: jobs at a time.
         gpus: names of all GPUs.
         general: settings of Hydra for every job.
-        lock: descriptor that each job inherits, see ``raytran.run.launcher.sweep_lock``.
+        lock: descriptor that each job inherits, see ``one_at_a_time``.
     """
 
     def __init__(self, limit: int, gpus: Sequence[str], general: Sequence[str], lock: int) -> None:

@@ -25,7 +25,7 @@ from raytran.run.memory import explained_out_of_memory
 from raytran.run.parent import Parent, check_parent, find_parent
 from raytran.run.provenance import provenance
 from raytran.run.settings import RunConfig
-from raytran.run.start_report import start_report
+from raytran.run.start_report import changed_settings, start_report
 from raytran.training.callbacks.stop_signals import StopRequestedError
 from raytran.training.checkpoint_file import read_checkpoint, read_newest
 from raytran.training.reconstruction import Reconstruction
@@ -135,6 +135,8 @@ def _start(cfg: DictConfig, run: RunConfig) -> tuple[Reconstruction, Path | None
             )
         load_weights(module.model, content, path)
         _log.info("continuing from step %d of %s", content.get("global_step", 0), path)
+        for line in changed_settings(content.get("config") or {}, plain(cfg)):
+            _log.warning("continued with another setting, %s", line)
         return module, path, content.get("parent")
     stage = _stage(cfg)
     start = find_parent(run, stage)
@@ -188,6 +190,7 @@ def _quiet() -> None:
         ".*in eval mode at the start of training.*",
         ".*isinstance.treespec, LeafSpec.*",
         ".*smaller than the logging interval.*",
+        "Grad strides do not match bucket view strides.*",  # of a convolution to one channel
         ".*recommended to use .*sync_dist=True.*",  # the metrics have gathered over the ranks themselves
     ):
         warnings.filterwarnings("ignore", message=pattern)

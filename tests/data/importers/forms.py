@@ -82,5 +82,37 @@ def write_transforms(walk: Walk, **changes) -> Path:
     return path
 
 
+def tum_line(time: float, pose: np.ndarray) -> str:
+    """Return ``timestamp tx ty tz qx qy qz qw`` of a camera-to-world matrix."""
+    turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    return f"{time:.6f} {words(pose[:3, 3])} {words(turn)}"
+
+
+def write_tum(walk: Walk, folder: Path, times, image_times=None) -> None:
+    """Write ``rgb/<time>.png``, ``trajectory.txt`` and ``intrinsics.txt``."""
+    (folder / "rgb").mkdir(parents=True)
+    image_times = times if image_times is None else image_times
+    for name, time in zip(walk.names, image_times, strict=True):
+        (folder / "rgb" / f"{time:.6f}.png").write_bytes((walk.folder / "images" / name).read_bytes())
+    lines = ["# ground truth"] + [tum_line(t, pose) for t, pose in zip(times, walk.poses, strict=True)]
+    (folder / "trajectory.txt").write_text("\n".join(lines) + "\n")
+    (folder / "intrinsics.txt").write_text(words(walk.camera))
+
+
+def write_video(walk: Walk, path: Path, *, rate: int = 10, size=None) -> None:
+    """Encode the walk's images as a video without loss of a grey level, with a frame every 1 / rate s."""
+    import av
+    from PIL import Image
+
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=rate, options={"crf": "4", "g": "5", "bf": "2"})
+        stream.height, stream.width = size or walk.image_size
+        stream.pix_fmt = "yuv420p"
+        for name in walk.names:
+            with Image.open(walk.folder / "images" / name) as image:
+                container.mux(stream.encode(av.VideoFrame.from_image(image.convert("RGB"))))
+        container.mux(stream.encode())
+
+
 def words(values) -> str:
     return " ".join(repr(float(value)) for value in values)

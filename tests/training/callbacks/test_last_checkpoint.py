@@ -37,7 +37,14 @@ MODULE = SimpleNamespace(device=torch.device("cpu"))
 
 def checkpoint(ranks=1, **changes):
     resume = {"validation_due": False, "random": [random_states(MODULE.device) for _ in range(ranks)]}
-    return {"global_step": 7, "resume": resume, "optimizer_states": [], "loops": {}, **changes}
+    return {
+        "global_step": 7,
+        "resume": resume,
+        "optimizer_states": [],
+        "lr_schedulers": [],
+        "loops": {},
+        **changes,
+    }
 
 
 def test_each_rank_gets_its_own_random_numbers(callback):

@@ -54,7 +54,13 @@ def read_nerfstudio(path: Path) -> Source:
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise DataError(f"{listed} lists no frames: export it again")
     undo = _undo(content, listed)
-    shots = tuple(_shot(content, frame, i, undo, listed) for i, frame in enumerate(frames))
+    images = [_image(frame, f"frame {i} of {listed}", listed) for i, frame in enumerate(frames)]
+    told = all("w" in facts and "h" in facts for facts in ({**content, **frame} for frame in frames))
+    size = None if told else stored_size(images)
+    shots = tuple(
+        _shot({**content, **frame}, image, size, undo, f"frame {i} of {listed}", _root(listed))
+        for i, (frame, image) in enumerate(zip(frames, images, strict=True))
+    )
     folders = sorted({shot.image.parent for shot in shots if shot.image.parent.is_dir()})
     unposed = {path for folder in folders for path in images_in(folder)} - {shot.image for shot in shots}
     dropped = {frame_name(path.relative_to(_root(listed)).as_posix()): NO_POSE for path in unposed}
@@ -63,42 +69,44 @@ def read_nerfstudio(path: Path) -> Source:
     )
 
 
-def _shot(
-    content: Mapping[str, Any], frame: Mapping[str, Any], index: int, undo: NDArray[np.float64], listed: Path
-) -> Shot:
-    where = f"frame {index} of {listed}"
+def _image(frame: Mapping[str, Any], where: str, listed: Path) -> Path:
+    """Return the path of a frame's image; one that is named without ending has the first that is there."""
     name = frame.get("file_path")
     if not isinstance(name, str) or not name:
         raise DataError(f"{where} has no file_path: export it again")
-    matrix = numbers(frame, "transform_matrix", where, (-1, 4))
+    image = path_inside(listed.parent, name, listed)
+    if image.suffix:
+        return image
+    return next((i for i in map(image.with_suffix, IMAGE_ENDINGS) if i.is_file()), image)
+
+
+def _shot(
+    facts: Mapping[str, Any],
+    image: Path,
+    size: tuple[int, int] | None,
+    undo: NDArray[np.float64],
+    where: str,
+    root: Path,
+) -> Shot:
+    matrix = numbers(facts, "transform_matrix", where, (-1, 4))
     if matrix.shape not in ((3, 4), (4, 4)):
         raise DataError(f"{where} has a transform_matrix of {matrix.size} numbers, not 16: export it again")
     pose = np.eye(4)
     pose[:3] = undo @ np.vstack([matrix[:3], [0, 0, 0, 1]])
     # The scale undone is of the world, not of the camera's axes.
     pose[:3, :3] /= np.cbrt(abs(np.linalg.det(undo[:, :3])))
-    image = path_inside(listed.parent, name, listed)
-    if not image.suffix:
-        image = next((i for i in map(image.with_suffix, IMAGE_ENDINGS) if i.is_file()), image)
-    return Shot(
-        frame_name(image.relative_to(_root(listed)).as_posix()),
-        image,
-        pose,
-        _lens({**content, **frame}, image, where),
-    )
+    return Shot(frame_name(image.relative_to(root).as_posix()), image, pose, _lens(facts, size, where))
 
 
-def _lens(facts: Mapping[str, Any], image: Path, where: str) -> Lens:
+def _lens(facts: Mapping[str, Any], size: tuple[int, int] | None, where: str) -> Lens:
     model = str(facts.get("camera_model", "OPENCV")).upper()
     if facts.get("is_fisheye") or model not in (*_PINHOLES, *_DISTORTED):
         raise DataError(
             f"{where} has the camera model {model if not facts.get('is_fisheye') else 'fisheye'}, which is "
             "not read: undistort the images to a pinhole camera and export them again"
         )
-    if "w" in facts and "h" in facts:
+    if size is None or ("w" in facts and "h" in facts):
         size = int(number(facts, "h", where)), int(number(facts, "w", where))
-    else:
-        size = stored_size([image])
     if min(size) < 1:
         raise DataError(f"{where} has a size of {size[1]}x{size[0]}: export it again")
     fx = _focal(facts, "fl_x", "camera_angle_x", size[1], where)

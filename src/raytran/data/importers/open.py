@@ -8,10 +8,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+from raytran.data.importers.arkit import find_log, read_arkit
 from raytran.data.importers.colmap import find_model, read_colmap
-from raytran.data.importers.imported import Source, from_files
+from raytran.data.importers.imported import ImportedScan, Source, from_files
 from raytran.data.importers.nerfstudio import find_transforms, read_nerfstudio
 from raytran.data.importers.orient import WorldSettings, to_our_world
+from raytran.data.importers.record3d import find_metadata, read_record3d
+from raytran.data.importers.tum import is_tum, read_tum
+from raytran.data.importers.video import find_video, from_video, read_video
 from raytran.data.scan import OpenScan
 from raytran.data.scan_layout import Listing, recognise
 from raytran.data.scannet import open_scan
@@ -22,15 +26,20 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class _Format:
-    """How to tell a format and to read it; ``read`` opens no image."""
+    """How to tell a format, to read its poses, and to open its images."""
 
     fits: Callable[[Path], bool]
     read: Callable[[Path], Source]
+    open: Callable[[Source], ImportedScan] = from_files
 
 
 _FORMATS = {
     "nerfstudio": _Format(lambda path: find_transforms(path) is not None, read_nerfstudio),
+    "record3d": _Format(lambda path: find_metadata(path) is not None, read_record3d),
+    "arkit": _Format(lambda path: find_log(path) is not None, read_arkit),
     "colmap": _Format(lambda path: find_model(path) is not None, read_colmap),
+    "tum": _Format(is_tum, read_tum),
+    "video": _Format(lambda path: find_video(path) is not None, read_video, from_video),
 }
 """Formats beside ScanNet's, the one to prefer first."""
 
@@ -59,8 +68,12 @@ def open_scene(path: Path, *, format: str = "auto", settings: WorldSettings | No
     if name == "scannet":
         return to_our_world(open_scan(path), settings, aligned=True)
     source = _FORMATS[name].read(path)
-    scan = from_files(source)
-    return to_our_world(scan, settings, axes=source.axes, up=source.up, metric=source.metric)
+    scan = _FORMATS[name].open(source)
+    try:
+        return to_our_world(scan, settings, axes=source.axes, up=source.up, metric=source.metric)
+    except BaseException:
+        scan.close()
+        raise
 
 
 def _recognised(path: Path) -> str:

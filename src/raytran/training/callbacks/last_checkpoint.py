@@ -17,6 +17,8 @@ from raytran.training.checkpoint_resume import loop_state, random_states, set_ra
 
 _log = logging.getLogger(__name__)
 
+_OF_LIGHTNING = {"optimizer_states", "lr_schedulers", "loops"}
+
 
 @runtime_checkable
 class ContinuedLogger(Protocol):
@@ -67,7 +69,7 @@ class LastCheckpoint(pl.Callback):
     ) -> None:
         """Set Lightning's counters to what the checkpoint means; remember the rest for the first step."""
         resumed, step = checkpoint.get("resume"), checkpoint.get("global_step")
-        if not isinstance(resumed, dict) or not isinstance(step, int) or "optimizer_states" not in checkpoint:
+        if not (isinstance(resumed, dict) and isinstance(step, int) and checkpoint.keys() >= _OF_LIGHTNING):
             raise CheckpointError(
                 f"{self._path} holds weights but no state of training: start a new run with init_from="
             )
@@ -136,13 +138,16 @@ class LastCheckpoint(pl.Callback):
         self._scores["step"] = trainer.global_step
 
     def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Write the final checkpoint.
+        """Write the final checkpoint."""
+        if trainer.global_step != self._written_at:
+            self._write(trainer)
+
+    def on_fit_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Let no run count as finished whose final checkpoint is missing; the ranks need no more each other.
 
         Raises:
-            CheckpointError: it cannot be written.
+            CheckpointError: it could not be written.
         """
-        if trainer.global_step != self._written_at or not self._path.is_file():
-            self._write(trainer)
         error = self._write_error(trainer)
         if error is not None:
             raise error
