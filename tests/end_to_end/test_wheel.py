@@ -42,7 +42,9 @@ def test_the_wheel_is_what_runs(site: Path, tmp_path: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize("command", ["train", "curriculum", "evaluate", "predict", "prepare", "demo"])
+@pytest.mark.parametrize(
+    "command", ["train", "curriculum", "evaluate", "predict", "prepare", "demo", "replay", "report"]
+)
 def test_commands_find_their_configs(site: Path, tmp_path: Path, command: str) -> None:
     shown = run(site, tmp_path, "-m", f"raytran.{command}", "--cfg", "job")
     assert shown.returncode == 0, shown.stderr
@@ -65,5 +67,6 @@ def test_rooms_are_made_where_the_user_is(site: Path, tmp_path: Path) -> None:
     assert (tmp_path / "rooms" / "scan2cad" / "full_annotations.json").is_file()
 
 
-def test_the_page_template_is_inside(site: Path) -> None:
-    assert (site / "raytran" / "view" / "templates" / "report.html.j2").is_file()
+@pytest.mark.parametrize("name", ["report.html.j2", "runs.html.j2", "doctor.html.j2", "page.css"])
+def test_the_page_templates_are_inside(name: str, site: Path) -> None:
+    assert (site / "raytran" / "view" / "templates" / name).is_file()

@@ -18,6 +18,10 @@ _MIN_HEIGHT = 240
 """Smaller frames are enlarged to this many rows, so that names can be read."""
 
 
+_MAX_FACES = 80_000
+"""More than the surface of any whole shape has, far fewer than that of noise, which takes minutes to draw."""
+
+
 def draw_scene(
     folder: Path, batch: SceneBatch, prediction: ScenePrediction, *, grid_extent: tuple[float, float, float]
 ) -> dict[str, Path]:
@@ -26,7 +30,8 @@ def draw_scene(
     Args:
         folder: made if it is missing.
         batch: one scene.
-        prediction: of that scene, on the CPU; with shapes, meshes are drawn into the frames.
+        prediction: of that scene, on the CPU; with shapes, meshes are drawn into the frames, but for those
+            that are nothing but noise yet.
         grid_extent: sizes of the voxel grid, metres.
 
     Returns:
@@ -58,7 +63,11 @@ def draw_scene(
 
 
 def _draw_boxes(path: Path, batch: SceneBatch, prediction: ScenePrediction) -> Path:
-    views, meshes = batch.views, object_meshes(prediction)
+    views = batch.views
+    meshes = [
+        mesh if mesh is not None and len(mesh.faces) <= _MAX_FACES else None
+        for mesh in object_meshes(prediction)
+    ]
     count = views.images.shape[1]
     tiles = []
     for n in choose_even(count, min(_FRAMES, count)).tolist():

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import lightning.pytorch as pl
 import pytest
 import torch
@@ -14,7 +16,7 @@ from raytran.training.callbacks.stage_setup import StageSetup
 def fit(batch, make_module):
     """Return a function that trains an experiment's module and returns the trainer."""
 
-    def run(*callbacks, experiment="stage2", module=None, loggers=False, **settings):
+    def run(*callbacks, experiment="stage2", module=None, loggers=False, validate=0, **settings):
         trainer = pl.Trainer(
             accelerator="cpu",
             logger=loggers,
@@ -25,7 +27,9 @@ def fit(batch, make_module):
             **{"log_every_n_steps": 1, "max_epochs": -1, **settings},
         )
         loader = torch.utils.data.DataLoader([batch] * 40, batch_size=None)
-        trainer.fit(make_module(experiment) if module is None else module, loader)
+        scenes = [replace(batch, scene_id=(f"scene{n}",)) for n in range(validate)]
+        held_out = torch.utils.data.DataLoader(scenes, batch_size=None) if validate else None
+        trainer.fit(make_module(experiment) if module is None else module, loader, held_out)
         return trainer
 
     return run

@@ -19,7 +19,6 @@ from raytran.data.atomic import finished_folder, no_room
 from raytran.data.collate import collate_scenes
 from raytran.data.views import choose_even
 from raytran.postprocess import select_objects
-from raytran.training.datamodule import SceneDataModule
 from raytran.training.reconstruction import Reconstruction
 from raytran.training.scores import DUPLICATE_IOU, SCORE_THRESHOLD
 from raytran.types import SceneBatch, ScenePrediction
@@ -46,12 +45,12 @@ class ScenePictures(pl.Callback):
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Draw and log."""
-        data: Any = getattr(trainer, "datamodule", None)
-        if not isinstance(pl_module, Reconstruction) or not isinstance(data, SceneDataModule):
+        dataset = getattr(trainer.val_dataloaders, "dataset", None)
+        if not isinstance(pl_module, Reconstruction) or dataset is None:
             return
-        if not trainer.is_global_zero:
+        if trainer.sanity_checking or not trainer.is_global_zero:
             return
-        step, found = trainer.global_step, self._predict(pl_module, data)
+        step, found = trainer.global_step, self._predict(pl_module, dataset)
         grid_extent = pl_module.model.grid_extent
         try:
             pictures = self._draw(found, step, grid_extent)
@@ -72,11 +71,8 @@ class ScenePictures(pl.Callback):
                 _log_wandb(logger, pictures, found, logged_at, grid_extent)
 
     @torch.no_grad()
-    def _predict(
-        self, module: Reconstruction, data: SceneDataModule
-    ) -> list[tuple[SceneBatch, ScenePrediction]]:
+    def _predict(self, module: Reconstruction, dataset: Any) -> list[tuple[SceneBatch, ScenePrediction]]:
         """Return the scenes, always the same ones, and what the network makes of them now."""
-        dataset: Any = data.split("val")
         chosen = dict.fromkeys(choose_even(len(dataset), min(self._scenes, len(dataset))).tolist())
         stage, found = module.stage, []
         for index in chosen:
