@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib.util
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from raytran.data.importers.orient import WorldSettings
 from raytran.errors import ConfigError, DataError
 
 from ..scan_forms import write_form
-from .forms import Walk, tum_line, words, write_colmap, write_transforms, write_tum, write_video
+from .forms import Walk, transforms, tum_line, words, write_colmap, write_transforms, write_tum, write_video
 from .test_arkit import WRITERS
 
 BLIND = WorldSettings(check=False)
@@ -59,6 +60,15 @@ def test_a_walk_is_the_same_in_every_form(walk, scannet, tmp_path):
         close = scan.read_color(9, (24, 32)).astype(int) - expected.read_color(9, (24, 32))
         assert np.abs(close).max() <= (4 if name == "video" else 0)
         scan.close()
+
+
+def test_paths_may_be_relative(walk, monkeypatch):
+    write_colmap(walk, walk.folder / "sparse" / "0", binary=True)
+    write_transforms(walk, frames=transforms(walk)["frames"][1:])
+    monkeypatch.chdir(walk.folder)
+    assert len(open_scene(Path("."), format="colmap", settings=BLIND)) == 12
+    scan = open_scene(Path("transforms.json"), settings=BLIND)
+    assert (scan.scene_id, scan.dropped) == ("walk", {"11": "no pose"})
 
 
 def test_the_format_may_be_named(walk, caplog):

@@ -17,9 +17,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from raytran.data.importers.imported import IMAGE_ENDINGS, Shot, Source, frame_name, path_inside
+from raytran.data.importers.imported import Shot, Source, frame_name, path_inside, unposed_images
 from raytran.data.importers.lens import Lens, check_lens
-from raytran.data.scannet import NO_POSE
 from raytran.errors import DataError
 from raytran.geometry.rotation import matrix_from_quaternion
 
@@ -109,12 +108,11 @@ def read_colmap(path: Path) -> Source:
         Shot(frame_name(image.name), path_inside(folder, image.name, listed), pose, lenses[image.camera])
         for image, pose in zip(images, poses, strict=True)
     )
-    known = {image.name for image in images}
-    unregistered = {frame_name(name): NO_POSE for name in _files_below(folder) if name not in known}
+    dropped = unposed_images(shots, folder)
     scene_id = next(
         part for part in (path.resolve(), *path.resolve().parents) if part.name not in ("0", "sparse")
     )
-    return Source(path=listed, scene_id=scene_id.name, shots=shots, dropped=unregistered)
+    return Source(path=listed, scene_id=scene_id.name, shots=shots, dropped=dropped)
 
 
 def _listing(folder: Path) -> str | None:
@@ -138,14 +136,6 @@ def _image_folder(path: Path, model: Path, names: list[str]) -> Path:
             if any((base / name / image).is_file() for image in tried if ".." not in image):
                 return base / name
     return path / "images"
-
-
-def _files_below(folder: Path) -> Iterator[str]:
-    """Yield names of images in a folder and its folders, as COLMAP writes them."""
-    for pattern in ("*", "*/*"):
-        for path in folder.glob(pattern):
-            if path.suffix.lower() in IMAGE_ENDINGS:
-                yield path.relative_to(folder).as_posix()
 
 
 def _world_from_camera(images: list[_Image]) -> NDArray[np.float64]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
@@ -19,7 +19,7 @@ from raytran.data.importers.lens import Lens, check_lens, needs_resampling, resa
 from raytran.data.importers.orient import Axes
 from raytran.data.scan import OpenScan
 from raytran.data.scan_text import are_rigid
-from raytran.data.scannet import LOST, NO_IMAGE, numbers_first
+from raytran.data.scannet import LOST, NO_IMAGE, NO_POSE, numbers_first
 from raytran.errors import DataError
 
 UNREADABLE = "image cannot be read"
@@ -233,6 +233,21 @@ def images_in(folder: Path) -> list[Path]:
     """Return the JPEG and PNG files in a folder, in the order of the numbers in their names."""
     found = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_ENDINGS]
     return sorted(found, key=lambda path: numbers_first(path.name))
+
+
+def unposed_images(shots: Sequence[Shot], root: Path) -> dict[str, str]:
+    """Return the images beside those of some shots that are no shot, with the reason.
+
+    Args:
+        shots: with images below ``root``.
+        root: folder from which frames are named.
+    """
+    folders = {shot.image.parent for shot in shots}
+    beside = {path for folder in folders if folder.is_dir() for path in images_in(folder)}
+    names = (
+        path.relative_to(os.path.abspath(root)).as_posix() for path in beside - {shot.image for shot in shots}
+    )
+    return {frame_name(name): NO_POSE for name in names}
 
 
 def path_inside(folder: Path, name: str, listed_in: Path) -> Path:

@@ -17,10 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from raytran.data.images import stored_size
-from raytran.data.importers.imported import IMAGE_ENDINGS, Shot, Source, frame_name, images_in, path_inside
+from raytran.data.importers.imported import (
+    IMAGE_ENDINGS,
+    Shot,
+    Source,
+    frame_name,
+    path_inside,
+    unposed_images,
+)
 from raytran.data.importers.json_file import number, numbers, read_object
 from raytran.data.importers.lens import Lens, check_lens
-from raytran.data.scannet import NO_POSE
 from raytran.errors import DataError
 
 NAMES = ("transforms.json", "transforms_train.json")
@@ -61,9 +67,7 @@ def read_nerfstudio(path: Path) -> Source:
         _shot({**content, **frame}, image, size, undo, f"frame {i} of {listed}", _root(listed))
         for i, (frame, image) in enumerate(zip(frames, images, strict=True))
     )
-    folders = sorted({shot.image.parent for shot in shots if shot.image.parent.is_dir()})
-    unposed = {path for folder in folders for path in images_in(folder)} - {shot.image for shot in shots}
-    dropped = {frame_name(path.relative_to(_root(listed)).as_posix()): NO_POSE for path in unposed}
+    dropped = unposed_images(shots, _root(listed))
     return Source(
         path=listed, scene_id=listed.resolve().parent.name, shots=shots, axes="opengl", dropped=dropped
     )
