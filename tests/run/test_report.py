@@ -95,7 +95,7 @@ def test_nothing_to_compare_is_one_sentence(tmp_path):
     with pytest.raises(DataError, match=r"holds no metrics\.csv"):
         find_runs([tmp_path])
     folder = write_run(tmp_path / "bad", table="step,train/total\n")
-    with pytest.raises(DataError, match="none of the runs can be read: .*bad is left out"):
+    with pytest.raises(DataError, match=r"none of the runs can be read: .*bad is left out"):
         read_runs([folder])
 
 

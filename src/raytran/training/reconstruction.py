@@ -50,7 +50,7 @@ class Reconstruction(pl.LightningModule):
         self.stage = stage
         self.optimization = optimization
         self.scores = SceneScores(tasks=stage.tasks)
-        self._forward = torch.compile(model.forward) if compiled else model.forward
+        self._compiled = torch.compile(model.forward) if compiled else None
         self.outcome: StepOutcome | None = None
         self._val_losses: dict[str, MeanMetric] = {}
 
@@ -94,7 +94,8 @@ class Reconstruction(pl.LightningModule):
         return self.optimization.build(self.model.parameters(), int(self.trainer.estimated_stepping_batches))
 
     def _run_model(self, batch: SceneBatch) -> RawScene:
-        return self._forward(batch.views, tasks=self.stage.tasks, grid_center=batch.grid_center)
+        run = self._compiled or self.model
+        return run(batch.views, tasks=self.stage.tasks, grid_center=batch.grid_center)
 
     def _losses(self, raw: RawScene, batch: SceneBatch, **options: Any) -> dict[str, Tensor]:
         return self.loss(
