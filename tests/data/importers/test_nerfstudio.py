@@ -137,3 +137,11 @@ def test_an_image_that_claims_to_be_huge_is_left_out(walk):
         (walk.folder / "images" / name).write_bytes(png)
     with pytest.raises(DataError, match=r"none of the 12 frames .*\(12 image cannot be read\)"):
         opened(walk)
+
+
+def test_a_list_that_is_too_long_to_be_one_is_refused_unread(walk):
+    path = write_transforms(walk)
+    with path.open("ab") as file:
+        file.truncate(65 * 2**20)
+    with pytest.raises(DataError, match="is larger than 64 MB, as no list of frames is: check the path"):
+        read_nerfstudio(path)

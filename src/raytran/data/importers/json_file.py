@@ -14,18 +14,18 @@ from numpy.typing import NDArray
 
 from raytran.errors import DataError
 
-_MAX_BYTES = 256 * 2**20
+_MAX_BYTES = 64 * 2**20
 
 
 def read_object(path: Path) -> dict[str, Any]:
     """Return the object that a JSON file holds.
 
     Raises:
-        DataError: the file cannot be read, is larger than 256 MB, or holds no JSON object.
+        DataError: the file cannot be read, is larger than 64 MB, or holds no JSON object.
     """
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise DataError(f"{path} is larger than 256 MB, as no list of frames is: check the path")
+            raise DataError(f"{path} is larger than 64 MB, as no list of frames is: check the path")
         content = json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise DataError(f"cannot read {path} ({error.strerror}): check the path") from error

@@ -29,7 +29,7 @@ _SAME_TIME = 0.005
 _LONGEST_GAP = 0.25
 """Seconds between two poses over which a pose is interpolated."""
 
-_MAX_BYTES = 256 * 2**20
+_MAX_BYTES = 64 * 2**20
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def read_table(path: Path) -> NDArray[np.float64]:
     """
     try:
         if path.stat().st_size > _MAX_BYTES:
-            raise DataError(f"{path} is larger than 256 MB, as no pose track is: check the path")
+            raise DataError(f"{path} is larger than 64 MB, as no pose track is: check the path")
         lines = path.read_text(encoding="utf-8-sig").splitlines()
         rows = [line.partition("#")[0].replace(",", " ").split() for line in lines]
         return np.array([[float(word) for word in row] for row in rows if row], dtype=np.float64)
