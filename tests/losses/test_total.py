@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields
+from typing import TypeVar
 
 import pytest
 import torch
@@ -12,8 +13,9 @@ from raytran.geometry.grid import VoxelGrid
 from raytran.heads.objects import ObjectHead
 from raytran.losses.matcher import HungarianMatcher
 from raytran.losses.total import TotalLoss
-from raytran.types import ObjectSet, RawObjects, RawScene, SceneBatch, Views
+from raytran.types import ObjectSet, RawObjects, RawProposals, RawScene, SceneBatch, Views
 
+RawParcel = TypeVar("RawParcel", RawObjects, RawProposals)
 WEIGHTS = {
     "occupancy": 1.0,
     "foreground": 0.5,
@@ -64,8 +66,8 @@ def test_pose_terms_are_means_over_objects(make_objects, make_perfect) -> None:
     )
 
 
-def join(*parts: RawObjects) -> RawObjects:
-    return RawObjects(*(torch.cat([getattr(part, f.name) for part in parts]) for f in fields(RawObjects)))
+def join(*parts: RawParcel) -> RawParcel:
+    return type(parts[0])(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(parts[0])))
 
 
 @pytest.mark.parametrize("counts", [(3, 1), (2, 0), (1, 0), (0, 0), (6, 2)])
@@ -76,7 +78,12 @@ def test_ranks_of_one_scene_take_the_step_of_one_rank(counts, make_objects) -> N
     raws = [RawObjects(*(torch.randn(1, 4, size, generator=g) for size in (10, 3, 3, 2, 4))) for _ in counts]
     decode = torch.nn.Sequential(torch.nn.Linear(4, 125), torch.nn.Unflatten(1, (5, 5, 5)))
     loss, options = total_loss(), {"terms": ("objects", "shape"), "decode_shapes": decode}
-    whole = loss(RawScene(torch.zeros(2, 3), objects=(join(*raws),)), batch(*scenes), **options)
+    voxels = [
+        RawProposals(*(torch.randn(1, 3, 3, 3, size, generator=g) for size in (3, 9, 3, 3, 2)))
+        for _ in counts
+    ]
+    joined = RawScene(torch.zeros(2, 3), objects=(join(*raws),), proposals=join(*voxels))
+    whole = loss(joined, batch(*scenes), **options)
 
     asked = []  # what each rank has to divide by
 
@@ -85,7 +92,7 @@ def test_ranks_of_one_scene_take_the_step_of_one_rank(counts, make_objects) -> N
         return divisors
 
     def rank(index: int, mean: Callable[[torch.Tensor], torch.Tensor]) -> dict[str, torch.Tensor]:
-        scene = RawScene(torch.zeros(1, 3), objects=(raws[index],))
+        scene = RawScene(torch.zeros(1, 3), objects=(raws[index],), proposals=voxels[index])
         return loss(scene, batch(scenes[index]), mean_over_ranks=mean, **options)
 
     for index in range(2):

@@ -145,9 +145,8 @@ class TotalLoss(nn.Module):
         divisors = raw.center.new_tensor([sum(len(objects) for objects in targets), weight])
         if mean_over_ranks is not None:
             divisors = mean_over_ranks(divisors)
-        # Without any object all sums are zero, whatever they are divided by. A bound of one would be wrong:
-        # one object on two ranks makes a half for each.
-        num_objects, class_weight = torch.where(divisors > 0, divisors, 1.0).unbind()
+        # Without any object, one a scene. A bound of one a rank would be wrong: on two ranks it makes two.
+        num_objects, class_weight = torch.where(divisors > 0, divisors, float(scenes)).unbind()
         return num_objects, class_weight
 
     def _weight(self, name: str) -> float:
