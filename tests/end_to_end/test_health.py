@@ -6,7 +6,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from raytran.errors import CheckpointError
+from raytran.errors import CheckpointError, ConfigError
 from raytran.run.entry import compose
 from raytran.run.folders import LAST
 from raytran.run.replay import replay
@@ -59,3 +59,21 @@ def test_a_checkpoint_is_no_replay(lost):
     folder, _ = lost
     with pytest.raises(CheckpointError, match="is a checkpoint without batches"):
         replay(compose("replay", [f"file={folder / LAST}"]))
+
+
+@pytest.mark.parametrize(
+    ("key", "target"), [("loss", "os.system"), ("stage", "raytran.training.stage.Other"), ("loss", None)]
+)
+def test_a_strangers_loss_is_not_run(key, target, lost, tmp_path):
+    folder, _ = lost
+    content = read_checkpoint(folder / "replay.pt")
+    content["config"][key]["_target_"] = target
+    torch.save(content, tmp_path / "replay.pt")
+    with pytest.raises(CheckpointError, match="a stage or a loss of another kind"):
+        replay(compose("replay", [f"file={tmp_path / 'replay.pt'}", "device=cpu"]))
+
+
+def test_an_unknown_precision_is_one_sentence(lost):
+    folder, _ = lost
+    with pytest.raises(ConfigError, match="unknown precision=8: choose one of 32-true, bf16-mixed, 16-mixed"):
+        replay(compose("replay", [f"file={folder / 'replay.pt'}", "precision=8"]))
