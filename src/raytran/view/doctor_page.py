@@ -3,17 +3,15 @@
 
 from __future__ import annotations
 
-import base64
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
-from raytran.data.atomic import write_text
 from raytran.data.doctor.examine import Examination
 from raytran.data.doctor.finding import Finding
 from raytran.view.doctor_figures import draw_frames, draw_plan, sight, telling_frames
+from raytran.view.page import data_uri, write_page
 
 _FRAMES = 3
 _PICTURED = 12
@@ -74,14 +72,6 @@ def write_doctor_page(
     Returns:
         ``path``.
     """
-    environment = Environment(
-        loader=PackageLoader("raytran", "view/templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters.update(png=_as_uri("image/png"), jpeg=_as_uri("image/jpeg"))
     ordered = sorted(examinations, key=lambda examination: not examination.faults)
     sections = [
         _section(examination, grid_extent, pictured=i < _PICTURED) for i, examination in enumerate(ordered)
@@ -92,9 +82,8 @@ def write_doctor_page(
         rows=[_row(examination) for examination in ordered],
         scans=sections,
     )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_text(path, environment.get_template("doctor.html.j2").render(page=page))
-    return path
+    filters = {name: partial(data_uri, media=f"image/{name}") for name in ("png", "jpeg")}
+    return write_page(path, "doctor.html.j2", filters=filters, page=page)
 
 
 def summary(examinations: Sequence[Examination], checked: Path, num_found: int) -> str:
@@ -144,10 +133,3 @@ def _part(examination: Examination, extent: tuple[float, float, float], title: s
     names = [recording.scan.frame_id[frame] for frame in frames]
     plan = draw_plan(examination, seen, extent)
     return _Part(title, plan, list(zip(names, pictures, strict=True)))
-
-
-def _as_uri(media: str) -> Callable[[bytes], str]:
-    def encode(content: bytes) -> str:
-        return f"data:{media};base64,{base64.b64encode(content).decode()}"
-
-    return encode

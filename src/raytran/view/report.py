@@ -3,15 +3,13 @@
 
 from __future__ import annotations
 
-import base64
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
 from raytran.types import CLASSES
+from raytran.view.page import data_uri, write_page
 from raytran.view.palette import class_hex
 
 _MEDIA = {".png": "image/png", ".jpg": "image/jpeg"}
@@ -85,28 +83,19 @@ def write_report(path: Path, report: Report) -> Path:
     Returns:
         ``path``.
     """
-    environment = Environment(
-        loader=PackageLoader("raytran", "view/templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters.update(data_uri=_data_uri, duration=_duration)
     seen = [name for name in CLASSES if any(name in split.per_class for split in report.splits)]
-    page = environment.get_template("report.html.j2").render(
+    return write_page(
+        path,
+        "report.html.j2",
+        filters={"data_uri": _data_uri, "duration": _duration},
         report=report,
         classes=[(name, class_hex(CLASSES.index(name))) for name in seen],
         files={name: os.path.relpath(file, path.parent) for name, file in report.files.items()},
     )
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    temporary.write_text(page, encoding="utf-8")
-    os.replace(temporary, path)
-    return path
 
 
 def _data_uri(path: Path) -> str:
-    return f"data:{_MEDIA[path.suffix]};base64,{base64.b64encode(path.read_bytes()).decode()}"
+    return data_uri(path.read_bytes(), _MEDIA[path.suffix])
 
 
 def _duration(seconds: float) -> str:

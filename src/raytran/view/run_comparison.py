@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -11,12 +10,11 @@ from io import BytesIO
 from pathlib import Path
 
 import matplotlib as mpl
-from jinja2 import Environment, PackageLoader, StrictUndefined
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from raytran.data.atomic import write_text
 from raytran.view.curves import History, running_mean
+from raytran.view.page import data_uri, write_page
 from raytran.view.palette import FAINT
 
 _COLORS = (
@@ -77,18 +75,13 @@ def write_run_comparison(path: Path, runs: Sequence[RunRecord], *, notes: Sequen
     Returns:
         ``path``.
     """
-    environment = Environment(
-        loader=PackageLoader("raytran", "view/templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
     names = sorted({name for run in runs for name in run.history}, key=_place)
     per_class = [name for name in names if _is_score(name) and name.count("/") == 3]
     overall = [name for name in names if _is_score(name) and name not in per_class]
     differing, same = _settings(runs)
-    page = environment.get_template("runs.html.j2").render(
+    return write_page(
+        path,
+        "runs.html.j2",
         title=runs[0].name if len(runs) == 1 else f"{len(runs)} runs compared",
         runs=[(run, _COLORS[i % len(_COLORS)]) for i, run in enumerate(runs)],
         notes=notes,
@@ -100,8 +93,6 @@ def write_run_comparison(path: Path, runs: Sequence[RunRecord], *, notes: Sequen
         same=same,
         charts=[(title, _charts(title, names, runs)) for title in _GROUPS],
     )
-    write_text(path, page)
-    return path
 
 
 def final(history: History, name: str) -> float | None:
@@ -183,7 +174,7 @@ def _chart(name: str, runs: Sequence[RunRecord], *, smooth: bool) -> str:
         axes.spines[:].set_color(FAINT)
         target = BytesIO()
         figure.savefig(target, format="svg", transparent=True, metadata={"Date": None})
-    return f"data:image/svg+xml;base64,{base64.b64encode(target.getvalue()).decode()}"
+    return data_uri(target.getvalue(), "image/svg+xml")
 
 
 def _draw(axes: Axes, pairs: Sequence[tuple[int, float]], index: int, *, smooth: bool) -> None:
