@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from raytran.data.rooms.generate import generate_rooms
+
 from .scan_forms import INTRINSICS, encode_color, encode_sens, look_along_x, write_form
 
 CUBE_OBJ = """v -0.5 -0.5 -0.5
@@ -35,6 +37,26 @@ f 1 8 4
 f 2 3 7
 f 2 7 6
 """
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The root of a data set with one furnished room of 20 frames."""
+    root = tmp_path_factory.mktemp("furnished") / "room"
+    generate_rooms(
+        root,
+        num_train=1,
+        num_val=0,
+        seed=3,
+        frames=20,
+        image_size=(180, 240),
+        min_objects=4,
+        max_objects=6,
+        room_size=((3.0, 4.0), (3.0, 4.0)),
+        processes=1,
+        progress=False,
+    )
+    return root
 
 
 @pytest.fixture

@@ -10,31 +10,10 @@ import pytest
 
 from raytran.data.doctor.matches import Matches, match_frames
 from raytran.data.doctor.recording import Recording
-from raytran.data.rooms.generate import generate_rooms
 from raytran.data.scannet import read_scan
 
 SCAN = "scene0000_00"
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-@pytest.fixture(scope="session")
-def room(tmp_path_factory):
-    """The root of a data set with one room of 20 frames."""
-    root = tmp_path_factory.mktemp("doctor") / "room"
-    generate_rooms(
-        root,
-        num_train=1,
-        num_val=0,
-        seed=3,
-        frames=20,
-        image_size=(180, 240),
-        min_objects=4,
-        max_objects=6,
-        room_size=((3.0, 4.0), (3.0, 4.0)),
-        processes=1,
-        progress=False,
-    )
-    return root
 
 
 @pytest.fixture(scope="session")

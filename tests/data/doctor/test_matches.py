@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from raytran.data.doctor.matches import match_frames, triangulate, world_points
+from raytran.data.doctor.matches import match_frames, triangulate
 
 
 def test_true_cameras_explain_exact_matches_and_give_their_depths(walk):
@@ -13,7 +13,9 @@ def test_true_cameras_explain_exact_matches_and_give_their_depths(walk):
     agrees, found = triangulate(matches, poses, intrinsics)
     assert agrees.all()
     np.testing.assert_allclose(found, depth, rtol=1e-6)
-    points = world_points(matches, found, poses, intrinsics)
+    rays = np.c_[matches.pixel[:, 0], np.ones(len(matches))] @ np.linalg.inv(intrinsics).T
+    first = poses[matches.frame[:, 0]]
+    points = np.einsum("nij,nj->ni", first[:, :3, :3], rays * found[:, None]) + first[:, :3, 3]
     second = poses[matches.frame[:, 1]]
     seen = np.einsum("nji,nj->ni", second[:, :3, :3], points - second[:, :3, 3]) @ intrinsics.T
     np.testing.assert_allclose(seen[:, :2] / seen[:, 2:], matches.pixel[:, 1], atol=1e-6)

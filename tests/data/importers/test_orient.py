@@ -13,7 +13,6 @@ from scipy.spatial.transform import Rotation
 from raytran.data.importers.colmap import read_colmap
 from raytran.data.importers.imported import from_files
 from raytran.data.importers.orient import WorldSettings, to_our_world
-from raytran.data.rooms.generate import generate_rooms
 from raytran.data.scannet import read_scan
 from raytran.errors import ConfigError
 
@@ -30,23 +29,9 @@ def scan(walk):
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory):
-    """A furnished room of 20 frames."""
-    root = tmp_path_factory.mktemp("orient")
-    generate_rooms(
-        root,
-        num_train=1,
-        num_val=0,
-        seed=3,
-        frames=20,
-        image_size=(180, 240),
-        min_objects=4,
-        max_objects=6,
-        room_size=((3.0, 4.0), (3.0, 4.0)),
-        processes=1,
-        progress=False,
-    )
-    return read_scan(root / "scannet" / "scans" / "scene0000_00")
+def furnished(room):
+    """The scan of a furnished room of 20 frames."""
+    return read_scan(room / "scannet" / "scans" / "scene0000_00")
 
 
 def moved(scan, turn=None, scale=1.0, camera=None):
@@ -167,20 +152,20 @@ def test_a_format_without_unit_says_what_one_metre_would_mean(scan, caplog):
     assert "unit" not in caplog.text
 
 
-def test_images_tell_opengl_axes_from_a_world_that_stands_on_its_head(room, caplog):
+def test_images_tell_opengl_axes_from_a_world_that_stands_on_its_head(furnished, caplog):
     # Both have up = -z by the cameras; only the images show which it is.
-    opengl = to_our_world(moved(room, camera=OPENGL), WorldSettings())
-    np.testing.assert_allclose(opengl.world_from_camera, room.world_from_camera.double(), atol=1e-6)
+    opengl = to_our_world(moved(furnished, camera=OPENGL), WorldSettings())
+    np.testing.assert_allclose(opengl.world_from_camera, furnished.world_from_camera.double(), atol=1e-6)
     assert "camera axes are opengl, not opencv as the format has it" in caplog.text
     assert "convention=opencv would keep them" in caplog.text
     caplog.clear()
-    on_its_head = to_our_world(moved(room, np.diag([1.0, -1.0, -1.0])), WorldSettings())
-    np.testing.assert_allclose(on_its_head.world_from_camera, room.world_from_camera.double(), atol=1e-6)
+    on_its_head = to_our_world(moved(furnished, np.diag([1.0, -1.0, -1.0])), WorldSettings())
+    np.testing.assert_allclose(on_its_head.world_from_camera, furnished.world_from_camera.double(), atol=1e-6)
     assert "camera axes" not in caplog.text
 
 
-def test_axes_that_were_asked_for_are_kept_and_contradicted(room, caplog):
-    opengl = moved(room, camera=OPENGL)
+def test_axes_that_were_asked_for_are_kept_and_contradicted(furnished, caplog):
+    opengl = moved(furnished, camera=OPENGL)
     kept = to_our_world(opengl, WorldSettings(convention="opencv", up="-z"))
     expected = moved(opengl, np.diag([1.0, -1.0, -1.0])).world_from_camera
     np.testing.assert_allclose(kept.world_from_camera, expected, atol=1e-12)
@@ -188,13 +173,15 @@ def test_axes_that_were_asked_for_are_kept_and_contradicted(room, caplog):
     assert "agree with the cameras as stored, 91% after the change; give convention=opengl" in caplog.text
 
 
-def test_millimetres_are_said_and_not_mended(room, caplog):
-    large = to_our_world(moved(room, scale=1000.0), WorldSettings())
-    np.testing.assert_allclose(large.world_from_camera[:, :3, 3], 1000.0 * room.world_from_camera[:, :3, 3])
+def test_millimetres_are_said_and_not_mended(furnished, caplog):
+    large = to_our_world(moved(furnished, scale=1000.0), WorldSettings())
+    np.testing.assert_allclose(
+        large.world_from_camera[:, :3, 3], 1000.0 * furnished.world_from_camera[:, :3, 3]
+    )
     assert "positions in millimetres" in caplog.text
     assert "nothing is scaled: give scale=0.001 if that is right" in caplog.text
     caplog.clear()
-    to_our_world(moved(room, scale=1000.0), WorldSettings(scale=0.001))
+    to_our_world(moved(furnished, scale=1000.0), WorldSettings(scale=0.001))
     assert "scale" not in caplog.text
 
 

@@ -125,16 +125,6 @@ def triangulate(
     return (distance < matches.tolerance_px) & (depth_one > 0) & (depth_two > 0), depth_one
 
 
-def world_points(
-    matches: Matches, depth: NDArray, world_from_camera: NDArray, intrinsics: NDArray
-) -> NDArray[np.float64]:
-    """Return the ``(n, 3)`` points at ``depth`` behind the matches' pixels in their first frames."""
-    rays = np.concatenate([matches.pixel[:, 0], np.ones((len(matches), 1))], axis=1)
-    points = rays @ np.linalg.inv(intrinsics).T * depth[:, None]
-    first = world_from_camera[matches.frame[:, 0]]
-    return np.einsum("nij,nj->ni", first[:, :3, :3], points) + first[:, :3, 3]
-
-
 class _Matcher:
     """Finds points once per frame."""
 
