@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from raytran.run.demo_page import ShownScene, headline, write_page
-from raytran.run.predict import PredictedScene, write_scene
+from raytran.run.scene_files import PredictedScene, write_scene
 from raytran.run.train import FitResult
 from raytran.types import CLASSES, ObjectSet, SceneBatch, ScenePrediction, Views
 

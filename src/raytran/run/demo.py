@@ -23,7 +23,8 @@ from raytran.run.curriculum import run_curriculum
 from raytran.run.demo_page import SPLITS, ShownScene, headline, write_page
 from raytran.run.entry import compose
 from raytran.run.evaluate import TASKS_WITH_SHAPE, evaluate_model
-from raytran.run.predict import predict_scene, write_scene
+from raytran.run.predict import predict_scene
+from raytran.run.scene_files import write_scene
 from raytran.run.steps import StepTimes
 from raytran.run.train import FitResult
 from raytran.training.datamodule import SceneDataModule

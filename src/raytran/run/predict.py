@@ -5,25 +5,20 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
-import trimesh
 from omegaconf import DictConfig
 
 from raytran.data.importers.open import open_scene
 from raytran.data.importers.orient import WorldSettings
 from raytran.data.scannet import even_views
-from raytran.export import write_prediction
-from raytran.geometry.camera import Cameras
 from raytran.model import RayTran
 from raytran.postprocess import object_meshes, select_objects
 from raytran.run.checkpoint import load_model, prediction_settings
 from raytran.run.device import choose_device
-from raytran.run.output import check_replaceable, replaced_folder
-from raytran.types import ObjectSet, ScenePrediction, Views
-from raytran.view.overlay import draw_overlays
-from raytran.view.topdown import draw_topdown
+from raytran.run.output import check_replaceable
+from raytran.run.scene_files import MARKER, PredictedScene, write_scene
+from raytran.types import Views
 
 _LOG = logging.getLogger(__name__)
 
@@ -32,17 +27,6 @@ _UNTRAINED = {
     "joint": "its meshes mean nothing yet; predict with a checkpoint of stage shape",
 }
 """Stage of the curriculum that is not the last → what to expect of its checkpoints."""
-
-MARKER = "scene.json"
-"""The file that tells a finished result."""
-
-
-@dataclass(frozen=True)
-class PredictedScene:
-    """A prediction whose best objects were chosen, and their meshes in the world (None: empty shape)."""
-
-    prediction: ScenePrediction
-    meshes: Sequence[trimesh.Trimesh | None]
 
 
 def predict(cfg: DictConfig) -> Path:
@@ -109,40 +93,6 @@ def predict_scene(
     )
     prediction = select_objects(raw.to("cpu"), score_threshold=score_threshold, duplicate_iou=duplicate_iou)
     return PredictedScene(prediction, object_meshes(prediction))
-
-
-def write_scene(
-    output: Path,
-    found: PredictedScene,
-    views: Views,
-    frame_ids: Sequence[str],
-    *,
-    grid_extent: tuple[float, float, float],
-    num_overlays: int = 4,
-    truth: ObjectSet | None = None,
-) -> None:
-    """Write ``scene.json``, ``scene.glb``, ``meshes/``, ``topdown.png`` and ``overlays/``, all or nothing.
-
-    Args:
-        output: folder; replaced if it is an earlier result.
-        found: what was predicted.
-        views: B = 1, what it was predicted from.
-        frame_ids: name of each frame.
-        grid_extent: sizes of the voxel grid, metres.
-        num_overlays: frames to draw over.
-        truth: annotated objects to draw in the plan, or None.
-
-    Raises:
-        ConfigError: ``output`` holds something that is no earlier result.
-    """
-    prediction = found.prediction
-    cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], views.image_size)
-    with replaced_folder(output, marker=MARKER) as folder:
-        draw_topdown(
-            folder / "topdown.png", prediction, truth=truth, cameras=cameras, grid_extent=grid_extent
-        )
-        draw_overlays(folder / "overlays", views, frame_ids, prediction, found.meshes, count=num_overlays)
-        write_prediction(folder, prediction, found.meshes)
 
 
 def _without_repeats(views: Views, frame_ids: Sequence[str]) -> tuple[Views, tuple[str, ...]]:

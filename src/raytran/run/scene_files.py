@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a prediction of one scene leaves behind: every file a user looks at, in one folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import trimesh
+
+from raytran.export import write_prediction
+from raytran.geometry.camera import Cameras
+from raytran.run.output import replaced_folder
+from raytran.types import ObjectSet, ScenePrediction, Views
+from raytran.view.overlay import draw_overlays
+from raytran.view.topdown import draw_topdown
+
+MARKER = "scene.json"
+"""The file that tells a finished result."""
+
+
+@dataclass(frozen=True)
+class PredictedScene:
+    """A prediction whose best objects were chosen, and their meshes in the world (None: empty shape)."""
+
+    prediction: ScenePrediction
+    meshes: Sequence[trimesh.Trimesh | None]
+
+
+def write_scene(
+    output: Path,
+    found: PredictedScene,
+    views: Views,
+    frame_ids: Sequence[str],
+    *,
+    grid_extent: tuple[float, float, float],
+    num_overlays: int = 4,
+    truth: ObjectSet | None = None,
+) -> None:
+    """Write ``scene.json``, ``scene.glb``, ``meshes/``, ``topdown.png`` and ``overlays/``, all or nothing.
+
+    Args:
+        output: folder; replaced if it is an earlier result.
+        found: what was predicted.
+        views: B = 1, what it was predicted from.
+        frame_ids: name of each frame.
+        grid_extent: sizes of the voxel grid, metres.
+        num_overlays: frames to draw over.
+        truth: annotated objects to draw in the plan, or None.
+
+    Raises:
+        ConfigError: ``output`` holds something that is no earlier result.
+    """
+    prediction = found.prediction
+    cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], views.image_size)
+    with replaced_folder(output, marker=MARKER) as folder:
+        draw_topdown(
+            folder / "topdown.png", prediction, truth=truth, cameras=cameras, grid_extent=grid_extent
+        )
+        draw_overlays(folder / "overlays", views, frame_ids, prediction, found.meshes, count=num_overlays)
+        write_prediction(folder, prediction, found.meshes)
