@@ -239,6 +239,19 @@ def test_predict_runs_in_eval_mode_without_gradients() -> None:
     assert prediction.foreground.shape == (2, 32, 48)
 
 
+def test_predict_says_how_many_views_saw_each_voxel_of_the_volume() -> None:
+    model, views = make_model(), make_views(views=3)
+    prediction = model.predict(views)
+    assert prediction.seen.shape == RESOLUTION
+    assert prediction.seen.max() == 3
+    behind, before = prediction.seen[:, :2], prediction.seen[:, 4:]
+    assert behind.max() == 0  # all look along +y
+    assert (before > 0).float().mean() > 0.4
+    away = model.predict(views, grid_center=torch.tensor([0.0, -50.0, 0.0]))
+    assert away.grid_center.tolist() == [0.0, -50.0, 0.0]
+    assert away.seen.max() == 0
+
+
 def test_stride_8_and_proposed_queries() -> None:
     model, views = make_model(stride=8, widths=(8, 4), queries="proposal"), make_views(scenes=2)
     raw = model(views)

@@ -22,6 +22,7 @@ from raytran.heads.slots import objects_of_slots
 from raytran.ops.block_pairs import BlockPairs
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_tracer import RayTracer
+from raytran.ops.traverse import count_views
 from raytran.types import ObjectSet, RawScene, ScenePrediction, Views
 
 TASKS = ("occupancy", "foreground", "objects")
@@ -154,8 +155,9 @@ class RayTran(nn.Module):
         score_threshold: float = 0.0,
         with_shapes: bool = True,
         views_at_once: int | None = None,
+        grid_center: Tensor | None = None,
     ) -> ScenePrediction:
-        """Predict one scene (B = 1). Puts the network in eval mode.
+        """Predict one scene (B = 1), counting the views of each voxel. Puts the network in eval mode.
 
         Args:
             views: posed images, batch dimension 1.
@@ -164,10 +166,13 @@ class RayTran(nn.Module):
             with_shapes: decode the objects' shapes.
             views_at_once: views that pass through the network together, None for all; the same result up to
                 rounding in less memory.
+            grid_center: ``(3,)`` centre of the voxel grid, metres; by default the mean camera position.
         """
         self.eval()
-        raw = self(views, views_at_once=views_at_once)
-        return self.decode(raw, [scene_id], score_threshold=score_threshold, with_shapes=with_shapes)[0]
+        center = None if grid_center is None else grid_center[None]
+        raw = self(views, views_at_once=views_at_once, grid_center=center)
+        found = self.decode(raw, [scene_id], score_threshold=score_threshold, with_shapes=with_shapes)[0]
+        return replace(found, seen=self._count_views(views, found.grid_center))
 
     @torch.no_grad()
     def decode(
@@ -189,6 +194,13 @@ class RayTran(nn.Module):
             )
             for scene, scene_id in enumerate(scene_ids)
         )
+
+    def _count_views(self, views: Views, grid_center: Tensor) -> Tensor:
+        cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], views.image_size)
+        grid = VoxelGrid(self.grid_resolution, self.grid_extent, grid_center)
+        stride = self.backbone.stride
+        size = (views.image_size[0] // stride, views.image_size[1] // stride)
+        return count_views(cameras, grid, size, self.rays_per_cell)
 
     def _objects(self, raw: RawScene, scene: int, score_threshold: float, with_shapes: bool) -> ObjectSet:
         if raw.objects is None:

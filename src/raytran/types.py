@@ -102,6 +102,7 @@ class ObjectSet(Parcel):
             frame; cell ``i`` spans ``[i/S - ½, (i+1)/S - ½] · size``. bool for ground truth, probability
             in [0, 1] for predictions.
         model_id: ``catid/id`` of each object's CAD model, or empty.
+        num_views: ``(M,)`` how many views saw each object's box, the mean over the box; None if not counted.
     """
 
     label: Tensor
@@ -112,6 +113,7 @@ class ObjectSet(Parcel):
     score: Tensor
     shape: Tensor | None = None
     model_id: tuple[str, ...] = ()
+    num_views: Tensor | None = None
 
     def __len__(self) -> int:
         return int(self.label.shape[0])
@@ -275,6 +277,7 @@ class ScenePrediction(Parcel):
         grid_center: ``(3,)`` centre of the voxel grid, metres.
         occupancy: ``(X, Y, Z)`` probability, or None.
         foreground: ``(N, H, W)`` probability, or None.
+        seen: ``(X, Y, Z)`` int32, how many views have a ray through each voxel, or None.
     """
 
     scene_id: str
@@ -282,3 +285,4 @@ class ScenePrediction(Parcel):
     grid_center: Tensor
     occupancy: Tensor | None = None
     foreground: Tensor | None = None
+    seen: Tensor | None = None

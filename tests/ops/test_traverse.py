@@ -15,7 +15,7 @@ from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.ops import reference
 from raytran.ops.pairs import PairList
-from raytran.ops.traverse import trace_pairs
+from raytran.ops.traverse import count_views, trace_pairs
 
 
 def _assert_equal(actual: PairList, expected: PairList) -> None:
@@ -185,6 +185,22 @@ def test_scenes_of_cameras_and_grid_must_agree(random_cameras):
         trace_pairs(random_cameras(2, 3, spread=1.0), VoxelGrid((2, 2, 2), (1, 1, 1), torch.zeros(3, 3)))
     with pytest.raises(ShapeError, match="leading shape"):
         trace_pairs(random_cameras(3, spread=1.0), VoxelGrid((2, 2, 2), (1, 1, 1), torch.zeros(1, 3)))
+
+
+def test_views_are_counted_from_the_pairs(random_cameras):
+    cameras = random_cameras(7, spread=1.0)
+    grid = VoxelGrid((6, 5, 3), (3.1, 2.3, 1.7), torch.zeros(3, dtype=torch.float64))
+    pairs = trace_pairs(cameras, grid, (3, 4), 2)
+    met = torch.zeros(7, grid.num_voxels, dtype=torch.bool)
+    met[pairs.pixel_index // 12, pairs.voxel_index] = True
+    counts = count_views(cameras, grid, (3, 4), 2)
+    assert counts.shape == (6, 5, 3)
+    assert 1 < counts.max() <= 7
+    assert torch.equal(counts.flatten(), met.sum(dim=0, dtype=torch.int32))
+    away = VoxelGrid((6, 5, 3), (0.1, 0.1, 0.1), torch.full((3,), 1e3, dtype=torch.float64))
+    assert count_views(cameras, away, (3, 4), 2).sum() == 0
+    with pytest.raises(ShapeError, match="intrinsics of shape"):
+        count_views(random_cameras(2, 3, spread=1.0), grid, (3, 4))
 
 
 def _lounge_cameras(scan: Path, count: int) -> Cameras:

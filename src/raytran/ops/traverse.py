@@ -18,7 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from raytran.errors import ShapeError
+from raytran.errors import ShapeError, check_shape
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.ops.pairs import PairList
@@ -95,6 +95,29 @@ def trace_pairs(
         pixel_shape=(views, *feature_size),
         voxel_shape=(scenes, *grid.resolution),
     )
+
+
+@torch.no_grad()
+def count_views(
+    cameras: Cameras, grid: VoxelGrid, feature_size: tuple[int, int] = (30, 40), rays_per_cell: int = 2
+) -> Tensor:
+    """Return how many views have a ray through each voxel, ``(X, Y, Z)`` int32.
+
+    Args:
+        cameras: the cameras of one scene, ``(N,)``; they are traced one by one, so that memory does not grow.
+        grid: its voxel grid, ``center`` ``(3,)``.
+        feature_size: as in ``trace_pairs``.
+        rays_per_cell: as in ``trace_pairs``.
+
+    Raises:
+        ShapeError: cameras or grid have other leading shapes.
+    """
+    check_shape(cameras.intrinsics, "N 3 3", "intrinsics")
+    counts = torch.zeros(grid.num_voxels, dtype=torch.int32, device=cameras.intrinsics.device)
+    for intrinsics, pose in zip(cameras.intrinsics.split(1), cameras.world_from_camera.split(1), strict=True):
+        one = Cameras(intrinsics, pose, cameras.image_size)
+        counts[trace_pairs(one, grid, feature_size, rays_per_cell).voxel_index.unique()] += 1
+    return counts.view(grid.resolution)
 
 
 def voxel_rays(
