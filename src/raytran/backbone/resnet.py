@@ -50,6 +50,8 @@ class ResNet18(nn.Module):
         width: channels of the first stage; 64 is ResNet-18, the output has ``8 · width``.
         stride: image pixels along each side of a feature cell, 16 (the paper) or 8, where the third stage
             keeps its resolution too: small images then keep more cells.
+        norm_momentum: share of each batch in the running statistics that the batch norms predict with; a tenth
+            remembers ten batches, which is few where a batch is the views of one scene.
         input_channels: 3, or 4 with a mask as input (RayTran §4). Weights for three channels are kept and
             the fourth starts at zero, so that the network begins as the pretrained one.
         weights: None (random), ``"imagenet"`` (fetched by URL, hash checked), ``"auto"`` (the same, but
@@ -66,6 +68,7 @@ class ResNet18(nn.Module):
         *,
         width: int = 64,
         stride: int = 16,
+        norm_momentum: float = 0.1,
         input_channels: int = 3,
         weights: str | Path | None = None,
     ) -> None:
@@ -85,6 +88,8 @@ class ResNet18(nn.Module):
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+            elif isinstance(module, nn.BatchNorm2d):
+                module.momentum = norm_momentum
         if weights is not None:
             if width != 64:
                 raise ConfigError(
