@@ -110,6 +110,7 @@ def test_all_files_are_written(scene, oracle, tmp_path):
     assert {path.name for path in output.iterdir()} == {
         "scene.json",
         "scene.glb",
+        "occupancy.ply",
         "meshes",
         "topdown.png",
         "overlays",

@@ -59,4 +59,6 @@ def write_scene(
             folder / "topdown.png", prediction, truth=truth, cameras=cameras, grid_extent=grid_extent
         )
         draw_overlays(folder / "overlays", views, frame_ids, prediction, found.meshes, count=num_overlays)
-        write_prediction(folder, prediction, found.meshes)
+        write_prediction(
+            folder, prediction, found.meshes, cameras=cameras, frame_ids=frame_ids, grid_extent=grid_extent
+        )
