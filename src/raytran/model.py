@@ -2,20 +2,22 @@
 """RayTran: posed images of a room → its objects, with class, pose and shape (Tyszkiewicz et al., ECCV 2022).
 
 This is the page to read first. The backbone lifts the images into a voxel grid (§3.1); heads read the
-result (§3.2): what is occupied, what is foreground in each view, and which objects there are.
+result (§3.2): what is occupied, what is foreground in each view, and which objects there are; or what the
+scene looks like from elsewhere (appendix A).
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 
 from raytran.backbone.backbone import Backbone
 from raytran.backbone.chunked import run_in_chunks
-from raytran.errors import ConfigError
+from raytran.errors import ConfigError, ShapeError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.heads.slots import objects_of_slots
@@ -26,7 +28,7 @@ from raytran.ops.traverse import count_views
 from raytran.types import ObjectSet, RawScene, ScenePrediction, Views
 
 TASKS = ("occupancy", "foreground", "objects")
-"""What ``forward`` can be asked for; shapes are decoded afterwards, for chosen queries only."""
+"""What ``forward`` is asked for by default; shapes are decoded afterwards, for chosen queries only."""
 
 SHAPES_AT_ONCE = 16
 
@@ -36,13 +38,13 @@ class RayTran(nn.Module):
 
     Args:
         backbone: images and pixel-voxel pairs → voxel and pixel features.
-        heads: ``occupancy``, ``foreground``, ``objects`` and ``shape``, or those of them that are needed.
+        heads: ``occupancy``, ``foreground``, ``objects``, ``shape`` and ``view``, or those that are needed.
         grid_resolution: ``(X, Y, Z)`` voxels.
         grid_extent: sizes of the voxel grid, metres.
         rays_per_cell: n×n rays join a cell of the feature map with the voxels they cross.
 
     Raises:
-        ConfigError: the foreground head does not grow the features back to image size.
+        ConfigError: the foreground or view head does not grow the features back to image size.
     """
 
     def __init__(
@@ -55,11 +57,12 @@ class RayTran(nn.Module):
         rays_per_cell: int = 2,
     ) -> None:
         super().__init__()
-        if "foreground" in heads and heads["foreground"].stride != backbone.stride:
-            raise ConfigError(
-                f"the foreground head grows features {heads['foreground'].stride}× and the encoder's stride "
-                f"is {backbone.stride}: give it one width for each halving but the last"
-            )
+        for name in ("foreground", "view"):
+            if name in heads and heads[name].stride != backbone.stride:
+                raise ConfigError(
+                    f"the {name} head grows features {heads[name].stride}× and the encoder's stride is "
+                    f"{backbone.stride}: give it one width for each halving but the last"
+                )
         self.backbone = backbone
         self.heads = nn.ModuleDict(heads)
         self.grid_resolution = (int(grid_resolution[0]), int(grid_resolution[1]), int(grid_resolution[2]))
@@ -74,25 +77,28 @@ class RayTran(nn.Module):
         tasks: Collection[str] = TASKS,
         grid_center: Tensor | None = None,
         views_at_once: int | None = None,
+        new_cameras: Cameras | None = None,
     ) -> RawScene:
         """Run the backbone once and the heads of ``tasks``.
 
         Args:
             views: posed images of B scenes.
-            tasks: some of ``TASKS``.
+            tasks: some of ``TASKS`` and ``view``.
             grid_center: ``(B, 3)`` centres of the voxel grids, metres; by default the mean camera position.
             views_at_once: views that pass through the network together, so that memory hardly grows with
                 their number; for prediction only. None: all of them.
+            new_cameras: what ``view`` renders, of leading shape ``(B, V)``; no other task sees them.
 
         Returns:
             Raw predictions, None for what was not asked for.
 
         Raises:
-            ConfigError: ``views_at_once`` is fewer than the views in training mode, or not positive.
+            ConfigError: ``views_at_once`` is fewer than the views in training mode, or not positive; or
+                ``view`` is asked for without new cameras, or of a network without that head.
             ShapeError: image sides are not divisible by the encoder's stride, or tensors do not have the
                 documented shapes.
         """
-        cameras = Cameras(views.intrinsics, views.world_from_camera, views.image_size)
+        cameras = Cameras.of(views)
         center = cameras.position.mean(dim=1) if grid_center is None else grid_center
         grid = VoxelGrid(self.grid_resolution, self.grid_extent, center)
         voxels, pixels = self._lift(views.images, cameras, grid, "foreground" in tasks, views_at_once)
@@ -103,6 +109,7 @@ class RayTran(nn.Module):
             foreground=None if pixels is None else self._foreground(pixels, views_at_once),
             objects=objects,
             proposals=proposals,
+            new_views=self._render(voxels, grid, new_cameras, views_at_once) if "view" in tasks else None,
         )
 
     def _lift(
@@ -130,6 +137,25 @@ class RayTran(nn.Module):
     def _foreground(self, pixels: Tensor, views_at_once: int | None) -> Tensor:
         some = pixels.split(views_at_once or pixels.shape[1], dim=1)
         logits = [self.heads["foreground"](chunk) for chunk in some]
+        return logits[0] if len(logits) == 1 else torch.cat(logits, dim=1)
+
+    def _render(
+        self, voxels: Tensor, grid: VoxelGrid, cameras: Cameras | None, views_at_once: int | None
+    ) -> Tensor:
+        """Run the view head, on a few cameras at a time if asked to."""
+        if "view" not in self.heads or cameras is None:
+            missing = "new_cameras" if "view" in self.heads else "a view head: train experiment=novel_view"
+            raise ConfigError(f"rendering new views needs {missing}")
+        stride = self.backbone.stride
+        height, width = cameras.image_size
+        if height % stride or width % stride:
+            raise ShapeError(f"expected new cameras with sides divisible by {stride}, got {height}x{width}")
+        size, count = (height // stride, width // stride), cameras.intrinsics.shape[1]
+        step = views_at_once or max(count, 1)
+        logits = []
+        for some in (cameras.select(slice(start, start + step)) for start in range(0, count, step)):
+            pairs = self.ray_tracer(some, grid, size, self.rays_per_cell)
+            logits.append(self.heads["view"](voxels, some, grid, pairs))
         return logits[0] if len(logits) == 1 else torch.cat(logits, dim=1)
 
     def decode_shapes(self, embedding: Tensor) -> Tensor:
@@ -175,6 +201,26 @@ class RayTran(nn.Module):
         return replace(found, seen=self._count_views(views, found.grid_center))
 
     @torch.no_grad()
+    def render(self, views: Views, cameras: Cameras, *, views_at_once: int | None = None) -> Tensor:
+        """Render one scene (B = 1) from new cameras. Puts the network in eval mode.
+
+        Args:
+            views: posed images, batch dimension 1.
+            cameras: of leading shape ``(1, V)``, in the world of ``views``, their sides divisible by the
+                encoder's stride.
+            views_at_once: views, old or new, that pass through the network together, None for all.
+
+        Returns:
+            ``(V, 3, H, W)`` red, green and blue in [0, 1].
+
+        Raises:
+            ConfigError: the network has no view head.
+        """
+        self.eval()
+        raw = self(views, tasks=("view",), views_at_once=views_at_once, new_cameras=cameras)
+        return cast("Tensor", raw.new_views)[0].float().sigmoid()
+
+    @torch.no_grad()
     def decode(
         self,
         raw: RawScene,
@@ -191,6 +237,7 @@ class RayTran(nn.Module):
                 grid_center=raw.grid_center[scene],
                 occupancy=None if raw.occupancy is None else raw.occupancy[scene].float().sigmoid(),
                 foreground=None if raw.foreground is None else raw.foreground[scene].float().sigmoid(),
+                new_views=None if raw.new_views is None else raw.new_views[scene].float().sigmoid(),
             )
             for scene, scene_id in enumerate(scene_ids)
         )
