@@ -19,7 +19,8 @@ LAYERS: list[set[str]] = [
     {"export", "view"},
     {"training"},
     {"run"},
-    {"train", "curriculum", "evaluate", "predict", "prepare", "plan", "demo", "replay", "report"},
+    {"train", "curriculum", "evaluate", "predict", "prepare", "plan", "demo", "replay", "report"}
+    | {"export_model"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 NEEDS_TRAINING = {"lightning", "hydra", "wandb"}

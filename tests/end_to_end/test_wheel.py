@@ -43,7 +43,8 @@ def test_the_wheel_is_what_runs(site: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "command", ["train", "curriculum", "evaluate", "predict", "prepare", "demo", "replay", "report"]
+    "command",
+    ["train", "curriculum", "evaluate", "predict", "prepare", "demo", "replay", "report", "export_model"],
 )
 def test_commands_find_their_configs(site: Path, tmp_path: Path, command: str) -> None:
     shown = run(site, tmp_path, "-m", f"raytran.{command}", "--cfg", "job")

@@ -7,15 +7,17 @@ import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
+
+import torch
 
 from raytran.errors import CheckpointError
-from raytran.training.checkpoint_file import FORMAT, read_checkpoint
+from raytran.training.checkpoint_content import FORMAT
+from raytran.training.checkpoint_file import read_checkpoint
+from raytran.training.weights_file import PREFIX
 
 if TYPE_CHECKING:
     from raytran.model import RayTran
-
-_PREFIX = "model."
 
 
 def checkpoint_card(
@@ -96,26 +98,35 @@ def model_from(checkpoint: Mapping[str, Any], path: Path) -> RayTran:
     from raytran.model import RayTran
     from raytran.run.checkpoint_config import build_network
 
-    model = build_network(checkpoint["model"], path)
-    if not isinstance(model, RayTran):
+    with torch.device("meta"):  # the file's size, and not what it claims, decides how much memory is taken
+        shell = build_network(checkpoint["model"], path)
+    if not isinstance(shell, RayTran):
         raise CheckpointError(f"{path} describes only a part of a network: do not use this file")
+    load_weights(shell, checkpoint, path, assign=True)
+    model = cast("RayTran", build_network(checkpoint["model"], path))
     load_weights(model, checkpoint, path)
     return model.eval()
 
 
-def load_weights(model: RayTran, checkpoint: Mapping[str, Any], path: Path) -> None:
+def load_weights(model: RayTran, checkpoint: Mapping[str, Any], path: Path, *, assign: bool = False) -> None:
     """Fill ``model`` with the weights of a checkpoint.
+
+    Args:
+        model: the network.
+        checkpoint: what ``read_checkpoint`` returned.
+        path: where from, for messages.
+        assign: take the checkpoint's tensors themselves, instead of copying into those of ``model``.
 
     Raises:
         CheckpointError: names or shapes differ.
     """
     state = {
-        name.removeprefix(_PREFIX): value
+        name.removeprefix(PREFIX): value
         for name, value in checkpoint["state_dict"].items()
-        if name.startswith(_PREFIX)
+        if name.startswith(PREFIX)
     }
     try:
-        model.load_state_dict(state)
+        model.load_state_dict(state, assign=assign)
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
         raise CheckpointError(

@@ -127,6 +127,10 @@ def _start(cfg: DictConfig, run: RunConfig) -> tuple[Reconstruction, Path | None
     found = _to_continue(run)
     if found is not None:
         path, content = found
+        if "resume" not in content:
+            raise CheckpointError(
+                f"{path} holds weights but no state of training: start a new run with init_from={path}"
+            )
         module = build_module(cfg, build_model(cfg, pretrained=False))
         if content["stage"] != module.stage.name:
             raise CheckpointError(
