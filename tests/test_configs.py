@@ -26,6 +26,7 @@ GIVEN_BY_CODE = {
         *("root", "split", "num_views", "view_choice", "targets", "augmentation"),
     },
     "raytran.run.rooms.ensure_rooms": {"output"},
+    "raytran.run.rooms.ensure_rooms_v1": {"output"},
 }
 # Part of the layout that scan2cad_dataset stands for.
 FIXED_BY_LAYOUT = {"scans_root", "scene_ids", "annotations", "shapenet_root"}
@@ -71,7 +72,9 @@ def arguments(path):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("data", [("data=rooms",), ("data=scan2cad", "data.root=somewhere")])
+@pytest.mark.parametrize(
+    "data", [("data=rooms",), ("data=rooms-v1",), ("data=scan2cad", "data.root=somewhere")]
+)
 def test_keys_are_arguments(preset, data):
     config = plain(train_config(f"preset={preset}", *data))
     nodes = list(nodes_with_target(config))
