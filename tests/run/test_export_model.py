@@ -11,49 +11,32 @@ from safetensors import safe_open
 
 import raytran
 from raytran.errors import CheckpointError, ConfigError
-from raytran.run.build import build_model, plain
-from raytran.run.checkpoint import checkpoint_card, prediction_settings
+from raytran.run.checkpoint import prediction_settings
 from raytran.run.entry import compose
 from raytran.run.export_model import export_model
 from raytran.run.parent import Parent
 from raytran.training.checkpoint_file import read_checkpoint, write_checkpoint
 from raytran.training.weights_file import write_weights
 
-
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """A checkpoint as training writes it, and the model in it."""
-    folder = tmp_path_factory.mktemp("run")
-    settings = [
-        "preset=tiny",
-        "model.grid_resolution=[8,8,4]",
-        "model.backbone.resnet.weights=/home/me/resnet.pth",
-    ]
-    config = compose("train", [*settings, "data.root=/home/me/rooms", f"output_dir={folder}"])
-    model = build_model(config, pretrained=False)
-    parent = {"path": "/home/me/stage2/last.ckpt", "stage": "joint", "step": 3, "scores": {"val/loss": 1.0}}
-    card = checkpoint_card(stage="shape", preset="tiny", config=plain(config), parent=parent)
-    state = {f"model.{name}": value for name, value in model.state_dict().items()}
-    more = {"scores": {"val/objects/f1_0.25": 0.5}, "global_step": 40, "optimizer_states": [{}]}
-    path = folder / "last.ckpt"
-    write_checkpoint(path, {**card, **more, "state_dict": {**state, "loss.scale": torch.ones(1)}})
-    return path, model
+from .conftest import Trained
 
 
 def exported(trained, folder, *settings):
     output = folder / "out" / "rooms.safetensors"
-    return export_model(compose("export_model", [f"checkpoint={trained[0]}", f"output={output}", *settings]))
+    return export_model(
+        compose("export_model", [f"checkpoint={trained.path}", f"output={output}", *settings])
+    )
 
 
 def test_the_network_comes_back_bit_by_bit(trained, tmp_path):
-    path, model = exported(trained, tmp_path), trained[1]
+    path, model = exported(trained, tmp_path), trained.model
     loaded = raytran.load(path)
     assert not loaded.training
     assert loaded.grid_resolution == (8, 8, 4)
     state = loaded.state_dict()
     assert all(torch.equal(value, state[name]) for name, value in model.state_dict().items())
-    assert prediction_settings(path) == prediction_settings(trained[0])
-    of_both = [Parent.of(file, read_checkpoint(file)) for file in (path, trained[0])]
+    assert prediction_settings(path) == prediction_settings(trained.path)
+    of_both = [Parent.of(file, read_checkpoint(file)) for file in (path, trained.path)]
     assert (of_both[0].stage, of_both[0].step, of_both[0].scores) == (
         "shape",
         40,
@@ -65,7 +48,7 @@ def test_the_network_comes_back_bit_by_bit(trained, tmp_path):
 def test_the_header_says_what_is_inside_and_nothing_of_the_machine(trained, tmp_path):
     with safe_open(exported(trained, tmp_path), framework="pt") as file:
         text, names = file.metadata()["raytran"], set(file.keys())
-    assert names == set(trained[1].state_dict())
+    assert names == set(trained.model.state_dict())
     card = json.loads(text)
     assert (card["stage"], card["preset"], card["global_step"]) == ("shape", "tiny", 40)
     assert card["parent"] == {"stage": "joint", "step": 3}
@@ -80,7 +63,7 @@ def test_half_the_size_rounds_the_weights(trained, tmp_path, dtype, bits):
     whole = exported(trained, tmp_path).stat().st_size
     half = exported(trained, tmp_path, f"dtype={dtype}")
     assert half.stat().st_size < 0.52 * whole
-    state, exact = raytran.load(half).state_dict(), trained[1].state_dict()
+    state, exact = raytran.load(half).state_dict(), trained.model.state_dict()
     for name, value in exact.items():
         assert state[name].dtype == value.dtype
         torch.testing.assert_close(state[name], value, rtol=2.0**-bits, atol=1e-7)
@@ -129,33 +112,38 @@ def test_a_file_is_not_exported_onto_itself(trained, tmp_path):
     ],
 )
 def test_weights_that_do_not_fit_are_named(trained, tmp_path, value, dtype, message):
-    content = torch.load(trained[0], weights_only=True)
+    content = torch.load(trained.path, weights_only=True)
     content["state_dict"]["model.backbone.unseen"][0] = value
     write_checkpoint(tmp_path / "last.ckpt", content)
     with pytest.raises(CheckpointError, match=rf"model\.backbone\.unseen in .*last\.ckpt.*{message}"):
-        exported((tmp_path / "last.ckpt",), tmp_path, f"dtype={dtype}")
+        exported(Trained(tmp_path / "last.ckpt", None), tmp_path, f"dtype={dtype}")
 
 
-def changed(content, **model):
+def put(path, content, **model):
+    """Write a file whose card asks for another network than its weights are of."""
     card = {name: value for name, value in content.items() if name not in ("state_dict", "optimizer_states")}
     state = {name.removeprefix("model."): value for name, value in content["state_dict"].items()}
-    return card | {"model": card["model"] | model}, state
+    write_weights(path, card | {"model": content["model"] | model}, state)
 
 
 def test_a_file_cannot_run_foreign_code(trained, tmp_path):
-    card, state = changed(
-        torch.load(trained[0], weights_only=True), heads={"_target_": "os.system", "command": "true"}
-    )
-    write_weights(tmp_path / "bad.safetensors", card, state)
+    path = tmp_path / "bad.safetensors"
+    put(path, torch.load(trained.path, weights_only=True), heads={"_target_": "os.system", "command": "true"})
     with pytest.raises(CheckpointError, match=r"bad\.safetensors asks to run 'os\.system'"):
-        raytran.load(tmp_path / "bad.safetensors")
+        raytran.load(path)
 
 
 def test_the_file_and_not_its_claim_decides_how_much_memory_is_taken(trained, tmp_path):
     """A network of a terabyte is described: it is refused before memory for it is asked for."""
-    content = torch.load(trained[0], weights_only=True)
+    content = torch.load(trained.path, weights_only=True)
     shape = content["model"]["heads"]["shape"] | {"widths": [1 << 17, 1 << 16, 64, 32]}
-    card, state = changed(content, heads=content["model"]["heads"] | {"shape": shape})
-    write_weights(tmp_path / "huge.safetensors", card, state)
+    put(tmp_path / "huge.safetensors", content, heads=content["model"]["heads"] | {"shape": shape})
     with pytest.raises(CheckpointError, match=r"huge\.safetensors \(preset tiny\) do not fit"):
         raytran.load(tmp_path / "huge.safetensors")
+
+
+def test_without_output_it_says_what_is_inside(trained, capsys):
+    assert export_model(compose("export_model", [f"checkpoint={trained.path}"])) is None
+    words = capsys.readouterr().out
+    for said in ("stage joint, 3 steps", "M, float32", "val/objects/f1_0.25", "0.5", torch.__version__):
+        assert said in words, said

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 import torch
 
 from raytran.errors import CheckpointError
+from raytran.run.weights import checkpoint_path
 from raytran.training.checkpoint_content import FORMAT
 from raytran.training.checkpoint_file import read_checkpoint
 from raytran.training.weights_file import PREFIX
@@ -53,7 +54,8 @@ def load_model(path: str | Path) -> RayTran:
     Raises:
         CheckpointError: the file is missing, damaged, or its weights do not fit the model described in it.
     """
-    return model_from(read_checkpoint(Path(path)), Path(path))
+    path = checkpoint_path(checkpoint)
+    return model_from(read_checkpoint(path), path)
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,8 @@ def prediction_settings(path: str | Path) -> PredictionSettings:
     Raises:
         CheckpointError: the file is missing or damaged.
     """
-    card = read_checkpoint(Path(path))
+    path = checkpoint_path(checkpoint)
+    card = read_checkpoint(path)
     views = card["views"]
     try:
         height, width = map(int, views["image_size"])

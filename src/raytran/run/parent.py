@@ -12,6 +12,7 @@ from typing import Any
 from raytran.errors import CheckpointError, ConfigError
 from raytran.run.folders import newest_finished
 from raytran.run.settings import RunConfig
+from raytran.run.weights import checkpoint_path
 from raytran.training.stage import Stage
 
 _log = logging.getLogger(__name__)
@@ -56,9 +57,10 @@ def find_parent(run: RunConfig, stage: Stage) -> Path | None:
 
     Raises:
         ConfigError: ``init_from=auto`` finds no finished run of the parent stage.
+        CheckpointError: ``init_from=default``, and the package was built without weights.
     """
     if run.init_from not in ("auto", "none"):
-        return Path(run.init_from)
+        return checkpoint_path(run.init_from)
     if run.init_from == "none" or stage.parent is None:
         return None
     found = newest_finished(

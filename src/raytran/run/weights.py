@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Weights to give away, out of checkpoints: what goes into the file, and in which precision."""
+"""Weights to give away: those that the package carries, and how a checkpoint becomes such a file."""
 
 from __future__ import annotations
 
@@ -10,13 +10,38 @@ from typing import Any
 import torch
 from torch import Tensor
 
+import raytran
 from raytran.errors import CheckpointError, ConfigError
-from raytran.training.weights_file import PREFIX, write_weights
+from raytran.training.weights_file import PREFIX, SUFFIX, write_weights
+
+DEFAULT = "default"
+"""Stands for the package's own weights wherever a checkpoint is named."""
+
+FOLDER = Path(raytran.__file__).resolve().parent / "weights"
+"""Where these are: one file, and the page that says what it can do."""
 
 DTYPES = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
 
 _KEPT = ("format", "stage", "preset", "model", "views", "scores", "global_step", "git_commit", "versions")
 """Of what a checkpoint says. The rest is the state of training, and settings that hold a machine's paths."""
+
+
+def checkpoint_path(checkpoint: str | Path) -> Path:
+    """Return the file that a checkpoint's name stands for.
+
+    Raises:
+        CheckpointError: it is ``default``, and the package was built without weights.
+    """
+    if str(checkpoint) != DEFAULT:
+        return Path(checkpoint)
+    found = sorted(FOLDER.glob(f"*{SUFFIX}"))
+    if len(found) != 1:
+        what = f"{len(found)} files of weights, not one," if found else "no weights"
+        raise CheckpointError(
+            f"there are {what} in {FOLDER}, which checkpoint=default stands for: give checkpoint=FILE, "
+            "a .ckpt file that training wrote or a .safetensors file that was exported from one"
+        )
+    return found[0]
 
 
 def export_weights(checkpoint: Mapping[str, Any], source: Path, output: Path, *, dtype: str) -> None:
