@@ -48,8 +48,11 @@ def checkpoint_card(
     }
 
 
-def load_model(path: str | Path) -> RayTran:
+def load_model(checkpoint: str | Path) -> RayTran:
     """Return the model of a checkpoint, in evaluation mode, on the CPU.
+
+    Args:
+        checkpoint: path of the file, or ``default`` for the weights that the package carries.
 
     Raises:
         CheckpointError: the file is missing, damaged, or its weights do not fit the model described in it.
@@ -75,8 +78,11 @@ class PredictionSettings:
     num_views: int
 
 
-def prediction_settings(path: str | Path) -> PredictionSettings:
+def prediction_settings(checkpoint: str | Path) -> PredictionSettings:
     """Read how a checkpoint is to be used.
+
+    Args:
+        checkpoint: path of the file, or ``default`` for the weights that the package carries.
 
     Raises:
         CheckpointError: the file is missing or damaged.
