@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from raytran.errors import ShapeError
-from raytran.ops.attention_weights import attention_weights, views_per_voxel
+from raytran.ops.attention_weights import attention_weights
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_attention import ray_attention
 from raytran.ops.reference import pair_mask
@@ -36,7 +36,6 @@ def test_half_precision_and_no_pair_at_all(generator):
     weights = attention_weights(torch.randn(5, 2, 3).half(), torch.randn(4, 2, 3).half(), none)
     assert weights.shape == (0,)
     assert weights.dtype == torch.float32
-    assert views_per_voxel(none, 2).tolist() == [0] * 5
 
 
 def test_wrong_sizes(random_pairs):
@@ -45,9 +44,3 @@ def test_wrong_sizes(random_pairs):
         attention_weights(torch.zeros(5, 1, 2), torch.zeros(5, 1, 2), pairs)
     with pytest.raises(ShapeError, match="key"):
         attention_weights(torch.zeros(6, 1, 2), torch.zeros(6, 1, 2), pairs)
-
-
-def test_views_are_counted_once_however_many_rays_they_send():
-    # Four views of three pixels; voxel 0 is crossed by rays of views 0 and 3, voxel 2 by all of view 1.
-    pixel, voxel = torch.tensor([0, 1, 3, 4, 5, 10]), torch.tensor([0, 0, 2, 2, 2, 0])
-    assert views_per_voxel(PairList(pixel, voxel, 12, 4), 3).tolist() == [2, 0, 1, 0]

@@ -122,10 +122,9 @@ def _write_volume(target: Path, number: int, volume: ViewedVolume) -> dict[str, 
 
     def write(name: str, values: Tensor) -> str:
         file = f"volume{number}_{name}.gz"
-        content = values.detach().cpu().contiguous().numpy()
-        (target / file).write_bytes(
-            gzip.compress(content.astype(content.dtype.newbyteorder("<")), 6, mtime=0)
-        )
+        content = values.detach().cpu().numpy()
+        little_endian = content.astype(content.dtype.newbyteorder("<")).tobytes()
+        (target / file).write_bytes(gzip.compress(little_endian, 6, mtime=0))
         return file
 
     if volume.occupancy is not None:

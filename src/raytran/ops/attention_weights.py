@@ -40,18 +40,3 @@ def attention_weights(query: Tensor, key: Tensor, pairs: PairList) -> Tensor:
         weight = score.sub_(segment_max(score, order).index_select(0, row)).exp_()
         mean += weight.div_(segment_sum(weight, order).index_select(0, row))
     return mean.div_(query.shape[1])
-
-
-def views_per_voxel(pairs: PairList, pixels_per_view: int) -> Tensor:
-    """Return how many views have a ray through each voxel, ``(num_voxels,)`` int64.
-
-    Args:
-        pairs: of one scene or several.
-        pixels_per_view: ``h · w`` cells of a feature map.
-    """
-    order = pairs.by("voxels")
-    view, row = order.col_index // pixels_per_view, row_of_pair(order)
-    # Pixels rise within a voxel, so those of one view are neighbours.
-    first = torch.ones_like(view, dtype=torch.bool)
-    first[1:] = (view[1:] != view[:-1]) | (row[1:] != row[:-1])
-    return torch.bincount(row[first], minlength=pairs.num_voxels)
