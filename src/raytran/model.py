@@ -15,8 +15,8 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from raytran.backbone.backbone import Backbone
 from raytran.backbone.chunked import run_in_chunks
+from raytran.backbone.lifting import LiftingBackbone
 from raytran.errors import ConfigError, ShapeError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
@@ -50,7 +50,7 @@ class RayTran(nn.Module):
     def __init__(
         self,
         *,
-        backbone: Backbone,
+        backbone: LiftingBackbone,
         heads: Mapping[str, nn.Module],
         grid_resolution: Sequence[int] = (48, 48, 16),
         grid_extent: Sequence[float] = (9.0, 9.0, 3.5),
@@ -120,7 +120,7 @@ class RayTran(nn.Module):
         def trace(some: Cameras) -> PairList | BlockPairs:
             stride = self.backbone.stride
             size = (images.shape[-2] // stride, images.shape[-1] // stride)
-            return self.ray_tracer(some, grid, size, self.rays_per_cell)
+            return (self.backbone.tracer or self.ray_tracer)(some, grid, size, self.rays_per_cell)
 
         if views_at_once is None or views_at_once >= images.shape[1]:
             return self.backbone(images, cameras, grid, trace(cameras), with_pixels=with_pixels)
