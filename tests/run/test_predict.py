@@ -93,6 +93,7 @@ def config(folder, output, **changes) -> DictConfig:
         "score_threshold": 0.5,
         "duplicate_iou": 0.5,
         "num_overlays": 2,
+        "turntable": 2,
         "views_at_once": 4,
         "device": "cpu",
     }
@@ -111,6 +112,7 @@ def test_all_files_are_written(scene, oracle, tmp_path):
         "scene.json",
         "scene.glb",
         "occupancy.ply",
+        "turntable.gif",
         "meshes",
         "topdown.png",
         "overlays",

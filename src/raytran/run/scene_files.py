@@ -15,6 +15,7 @@ from raytran.run.output import replaced_folder
 from raytran.types import ObjectSet, ScenePrediction, Views
 from raytran.view.overlay import draw_overlays
 from raytran.view.topdown import draw_topdown
+from raytran.view.turntable import draw_turntable
 
 MARKER = "scene.json"
 """The file that tells a finished result."""
@@ -36,9 +37,10 @@ def write_scene(
     *,
     grid_extent: tuple[float, float, float],
     num_overlays: int = 4,
+    turntable: int = 24,
     truth: ObjectSet | None = None,
 ) -> None:
-    """Write ``scene.json``, ``scene.glb``, ``meshes/``, ``topdown.png`` and ``overlays/``, all or nothing.
+    """Write what ``docs/outputs.md`` lists, all or nothing.
 
     Args:
         output: folder; replaced if it is an earlier result.
@@ -47,6 +49,7 @@ def write_scene(
         frame_ids: name of each frame.
         grid_extent: sizes of the voxel grid, metres.
         num_overlays: frames to draw over.
+        turntable: pictures of the turn in ``turntable.gif``; 0: there is none.
         truth: annotated objects to draw in the plan, or None.
 
     Raises:
@@ -58,6 +61,14 @@ def write_scene(
         draw_topdown(
             folder / "topdown.png", prediction, truth=truth, cameras=cameras, grid_extent=grid_extent
         )
+        if turntable:
+            draw_turntable(
+                folder / "turntable.gif",
+                prediction.objects,
+                found.meshes,
+                cameras=cameras,
+                num_frames=turntable,
+            )
         draw_overlays(folder / "overlays", views, frame_ids, prediction, found.meshes, count=num_overlays)
         write_prediction(
             folder, prediction, found.meshes, cameras=cameras, frame_ids=frame_ids, grid_extent=grid_extent

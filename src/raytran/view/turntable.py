@@ -136,11 +136,16 @@ def _orbit(points: Tensor, num_frames: int) -> Cameras:
 
 def _solid(ids: Tensor, depth: Tensor, rays: Tensor, colors: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Return a picture ``(H, W, 3)`` of the nearest meshes, lit from the camera, on white."""
-    covered = (ids >= 0).numpy()
-    picture = np.full((*covered.shape, 3), _PAPER, dtype=np.uint8)
+    picture = np.full((*ids.shape, 3), _PAPER, dtype=np.uint8)
+    covered = ids >= 0
     if covered.any():
-        light = headlight(depth, rays).numpy()[covered][:, None]
-        picture[covered] = (colors[ids.numpy()[covered]] * light).clip(0, 255).round()
+        # Only the part with meshes is lit.
+        top, left = (int(covered.any(dim=axis).nonzero()[0]) for axis in (1, 0))
+        bottom, right = (int(covered.any(dim=axis).nonzero()[-1]) + 1 for axis in (1, 0))
+        part = (slice(max(top - 1, 0), bottom + 1), slice(max(left - 1, 0), right + 1))
+        inside = covered[part]
+        light = headlight(depth[part], rays[part])[inside].numpy()[:, None]
+        picture[part][inside.numpy()] = (colors[ids[part][inside].numpy()] * light).clip(0, 255).round()
     return picture
 
 
