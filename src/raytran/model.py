@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -25,12 +25,21 @@ from raytran.ops.block_pairs import BlockPairs
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_tracer import RayTracer
 from raytran.ops.traverse import count_views
-from raytran.types import ObjectSet, RawScene, ScenePrediction, Views
+from raytran.types import ObjectSet, RawScene, SceneBatch, ScenePrediction, Views
 
 TASKS = ("occupancy", "foreground", "objects")
 """What ``forward`` is asked for by default; shapes are decoded afterwards, for chosen queries only."""
 
 SHAPES_AT_ONCE = 16
+
+
+def inputs_of(batch: SceneBatch) -> dict[str, Any]:
+    """Return what ``RayTran.forward`` is given of a batch; of the new views that is their cameras alone."""
+    return {
+        "views": batch.views,
+        "grid_center": batch.grid_center,
+        "new_cameras": None if batch.new_views is None else Cameras.of(batch.new_views),
+    }
 
 
 class RayTran(nn.Module):

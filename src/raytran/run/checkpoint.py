@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -117,7 +117,14 @@ def model_from(checkpoint: Mapping[str, Any], path: Path) -> RayTran:
     return model.eval()
 
 
-def load_weights(model: RayTran, checkpoint: Mapping[str, Any], path: Path, *, assign: bool = False) -> None:
+def load_weights(
+    model: RayTran,
+    checkpoint: Mapping[str, Any],
+    path: Path,
+    *,
+    assign: bool = False,
+    begins: Sequence[str] = (),
+) -> None:
     """Fill ``model`` with the weights of a checkpoint.
 
     Args:
@@ -125,6 +132,7 @@ def load_weights(model: RayTran, checkpoint: Mapping[str, Any], path: Path, *, a
         checkpoint: what ``read_checkpoint`` returned.
         path: where from, for messages.
         assign: take the checkpoint's tensors themselves, instead of copying into those of ``model``.
+        begins: parts that keep the weights they have if the checkpoint has none of theirs.
 
     Raises:
         CheckpointError: names or shapes differ.
@@ -134,6 +142,8 @@ def load_weights(model: RayTran, checkpoint: Mapping[str, Any], path: Path, *, a
         for name, value in checkpoint["state_dict"].items()
         if name.startswith(PREFIX)
     }
+    fresh = [f"{part}." for part in begins if not any(name.startswith(f"{part}.") for name in state)]
+    state |= {name: value for name, value in model.state_dict().items() if name.startswith(tuple(fresh))}
     try:
         model.load_state_dict(state, assign=assign)
     except RuntimeError as error:

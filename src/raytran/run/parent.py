@@ -77,7 +77,7 @@ def find_parent(run: RunConfig, stage: Stage) -> Path | None:
 
 
 def check_parent(parent: Parent, stage: Stage, check: str) -> None:
-    """Raise unless ``parent`` is of the stage that ``stage`` builds on, or of its own, and knows its task.
+    """Raise unless ``parent`` is of a stage that ``stage`` builds on, or of its own, and knows its task.
 
     Args:
         parent: the checkpoint to start from.
@@ -87,7 +87,7 @@ def check_parent(parent: Parent, stage: Stage, check: str) -> None:
     Raises:
         CheckpointError: the parent is of another stage or its validation score is too low.
     """
-    if stage.parent is None or parent.stage == stage.name:
+    if stage.parent is None or parent.stage in (stage.name, *stage.other_parents):
         return
     again = f"train experiment={stage.parent_experiment}"
     if parent.stage != stage.parent:

@@ -150,7 +150,7 @@ def _start(cfg: DictConfig, run: RunConfig) -> tuple[Reconstruction, Path | None
     parent = Parent.of(start, content)
     check_parent(parent, stage, run.check_parent)
     module = build_module(cfg, build_model(cfg, pretrained=False))
-    load_weights(module.model, content, start)
+    load_weights(module.model, content, start, begins=module.stage.begins)
     return module, None, parent.as_plain()
 
 
