@@ -19,6 +19,9 @@ OVERLAP = 1.5
 AHEAD = 1.5
 """A volume is to hold the cameras, and the places this far ahead of them, metres."""
 
+BESIDE = 0.5
+"""Several volumes also hold what stands this far beside the outermost of these, metres."""
+
 MOST = 256
 """More volumes than this are no room but positions in another unit."""
 
@@ -134,6 +137,7 @@ def _along_axis(low: float, high: float, mean: float, *, length: float, count: i
     """Return the centres along an axis of volumes of one length, of ``count`` voxels, that cover a range."""
     if high - low <= length:
         return torch.tensor([min(max(mean, high - length / 2), low + length / 2)], dtype=torch.float64)
+    low, high = low - BESIDE, high + BESIDE
     voxel = length / count
     longest_step = max(math.floor((length - min(OVERLAP, length / 2)) / voxel), 1)
     volumes = 1 + math.ceil((high - low - length) / (longest_step * voxel))
