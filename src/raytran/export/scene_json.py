@@ -23,7 +23,9 @@ def write_scene_json(path: Path, prediction: ScenePrediction, mesh_names: Sequen
     """Write a prediction's objects, in their order.
 
     ``center`` and ``rotation`` are in the world of the input poses (+Z up, metres); ``size`` and ``rotation``
-    follow the object frame (x width, y height, z depth; +Y up, front -Z); ``yaw`` is in radians.
+    follow the object frame (x width, y height, z depth; +Y up, front -Z); ``yaw`` is in radians. Where views
+    were counted, ``num_views`` says how many saw the object's box and ``confidence`` is the score times
+    ``n / (n + 1)`` of that number: what few saw is less certain than its score.
 
     Args:
         path: the file; written whole or not at all.
@@ -46,6 +48,9 @@ def write_scene_json(path: Path, prediction: ScenePrediction, mesh_names: Sequen
             "yaw": float(yaw[i]),
             "mesh": mesh,
         }
+        if objects.num_views is not None:
+            views = float(objects.num_views[i])
+            entry |= {"num_views": round(views, 1), "confidence": entry["score"] * views / (views + 1)}
         if objects.model_id and objects.model_id[i]:
             entry["catid_cad"], entry["id_cad"] = objects.model_id[i].split("/", 1)
         entries.append(entry)
