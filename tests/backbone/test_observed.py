@@ -9,6 +9,7 @@ from raytran.backbone.backbone import Backbone
 from raytran.backbone.chunked import run_in_chunks
 from raytran.backbone.observed import observe_attention
 from raytran.backbone.resnet import ResNet18
+from raytran.errors import ShapeError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.ops.traverse import trace_pairs
@@ -42,13 +43,12 @@ def test_what_voxels_ask_and_pixels_answer_is_kept(run):
     with observe_attention(backbone) as record:
         seen = go()
     torch.testing.assert_close(seen, expected, rtol=0, atol=0)
-    query, key = record.once()
+    ((query, key),) = record.runs([18])
     assert (query.shape, key.shape) == ((48, 2, 4), (18, 2, 4))
     with observe_attention(backbone) as chunked:
         go(views_at_once=2)
     assert len(chunked.keys) == 2
-    torch.testing.assert_close(chunked.once()[0], query, rtol=1e-4, atol=1e-5)
-    torch.testing.assert_close(chunked.once()[1], key, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(chunked.runs([18]), [(query, key)], rtol=1e-4, atol=1e-5)
 
 
 def test_it_is_the_last_block_that_is_observed(run):
@@ -59,7 +59,7 @@ def test_it_is_the_last_block_that_is_observed(run):
         go()
     handle.remove()
     expected = backbone.blocks[1].voxel_stream.query(inputs[0]).view(48, 2, 4)
-    torch.testing.assert_close(record.once()[0], expected.detach())
+    torch.testing.assert_close(record.runs([18])[0][0], expected.detach())
 
 
 def test_nobody_listens_afterwards(run):
@@ -67,16 +67,22 @@ def test_nobody_listens_afterwards(run):
     with pytest.raises(ZeroDivisionError), observe_attention(backbone) as record:
         raise ZeroDivisionError
     go()
-    assert record.once() is None
+    assert record.queries == record.keys == []
     assert not any(module._forward_hooks for module in backbone.modules())
 
 
-def test_several_runs_and_networks_without_rays_have_no_record(run):
+def test_several_runs_are_told_apart(run):
     backbone, go = run
     with observe_attention(backbone) as record:
         go()
-        go()
-    assert record.once() is None
+        go(views_at_once=2)
+    first, second = record.runs([18, 18])
+    torch.testing.assert_close(first, second, rtol=1e-4, atol=1e-5)
+    with pytest.raises(ShapeError, match="expected 1 runs on 18 pixels, observed 2 on 36"):
+        record.runs([18])
+
+
+def test_a_network_without_rays_has_no_record():
     with observe_attention(nn.Linear(2, 2)) as record:
         pass
     assert record is None

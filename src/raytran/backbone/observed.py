@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from raytran.backbone.block import RayTracedBlock
+from raytran.errors import ShapeError
 
 
 @dataclass
@@ -27,11 +28,22 @@ class ObservedAttention:
     queries: list[Tensor] = field(default_factory=list)
     keys: list[Tensor] = field(default_factory=list)
 
-    def once(self) -> tuple[Tensor, Tensor] | None:
-        """Return the query ``(V, H, D)`` and key ``(P, H, D)`` if the network has run once, for one scene."""
-        if len(self.queries) != 1:
-            return None
-        return self.queries[0], torch.cat(self.keys)
+    def runs(self, num_pixels: Sequence[int]) -> list[tuple[Tensor, Tensor]]:
+        """Return the query ``(V, H, D)`` and key ``(n, H, D)`` of each run of the network.
+
+        Args:
+            num_pixels: n of each run, over all views and scenes.
+
+        Raises:
+            ShapeError: it has not run so often, or on other numbers of pixels.
+        """
+        given = sum(len(key) for key in self.keys)
+        if len(self.queries) != len(num_pixels) or given != sum(num_pixels):
+            raise ShapeError(
+                f"expected {len(num_pixels)} runs on {sum(num_pixels)} pixels, "
+                f"observed {len(self.queries)} on {given}"
+            )
+        return list(zip(self.queries, torch.cat(self.keys).split(list(num_pixels)), strict=True))
 
     def _split(self, features: Tensor) -> Tensor:
         return features.detach().flatten(0, -2).unflatten(-1, (self.num_heads, -1)).cpu()

@@ -68,11 +68,17 @@ def make_views(count: int, size: tuple[int, int]) -> Views:
 
 
 def write_result(
-    folder: Path, *, num_objects: int = 6, num_frames: int = 5, subdivisions: int = 2, with_view: bool = True
+    folder: Path,
+    *,
+    num_objects: int = 6,
+    num_frames: int = 5,
+    size: tuple[int, int] = (48, 64),
+    subdivisions: int = 2,
+    with_view: bool = True,
 ) -> Path:
     """Write a scene of which the truth is known: object 0 is as predicted, the others stand 30 cm beside."""
     folder.mkdir(parents=True)
-    size, resolution = (48, 64), (16, 16, 6)
+    resolution = (16, 16, 6)
     objects, views = make_objects(num_objects), make_views(num_frames, size)
     grid = VoxelGrid(resolution, EXTENT, torch.tensor([0.0, 0.0, 1.0]))
     centers = grid.voxel_centers()

@@ -84,6 +84,12 @@ export function voxelAt(volume, point) {
   return index.every((value, axis) => value >= 0 && value < volume.resolution[axis]) ? index : null;
 }
 
+/** Of the volumes that hold a point the one whose middle is nearest, or undefined. */
+export function ownerOf(volumes, point) {
+  const distance = (volume) => Math.hypot(...point.map((value, axis) => (value - volume.center[axis]) / volume.extent[axis]));
+  return volumes.filter((volume) => voxelAt(volume, point)).sort((a, b) => distance(a) - distance(b))[0];
+}
+
 export const flatIndex = (volume, [x, y, z]) => (x * volume.resolution[1] + y) * volume.resolution[2] + z;
 
 export function unflatten(volume, flat) {

@@ -1,16 +1,21 @@
 // SPDX-License-Identifier: Apache-2.0
 // The page: what is shown where, and what happens when one clicks.
 
-import { flatIndex, readScene, readsOf, voxelAt, voxelCenter } from "./data.js";
+import { flatIndex, ownerOf, readScene, readsOf, voxelAt, voxelCenter } from "./data.js";
 import { FramePanel } from "./frame.js";
 import { Objects } from "./objects.js";
 import { World } from "./world.js";
+import { hasWebGL } from "./webgl.js";
 import { Vector3 } from "./vendor/three.js";
 
 const element = (id) => document.getElementById(id);
 const LAYERS = ["meshes", "boxes", "labels", "cameras", "truth", "voxels"];
 const state = { data: null, frame: 0, object: null, reads: null, volume: null };
 
+if (!hasWebGL()) {
+  say("This browser cannot draw in three dimensions: it needs WebGL 2 (see chrome://gpu or about:support).", true);
+  throw new Error("no WebGL 2");
+}
 const world = new World(element("canvas"), element("labels"), (hit, wantsVoxel) => {
   if (wantsVoxel) return selectVoxel(hit?.point);
   if (!hit) return selectObject(null);
@@ -23,28 +28,34 @@ const panel = new FramePanel(element("frame"), ({ origin, direction }) => {
 });
 const objects = new Objects(element("columns"), element("objects"), element("details"), (index) => selectObject(index));
 
+let opened = 0;
+
 async function open(number) {
-  const started = performance.now();
+  const turn = ++opened;
+  const started = turn > 1 ? performance.now() : 0; // the first time counts from the click that led here
   say("loading…");
   delete document.documentElement.dataset.ready;
   try {
     const data = await readScene(number);
+    if (turn !== opened) return; // another was chosen meanwhile
     Object.assign(state, { data, frame: 0, object: null, reads: null, volume: null });
     element("title").textContent = document.title = data.id || "raytran";
     for (const part of document.querySelectorAll("[data-needs]")) part.hidden = !has(data, part.dataset.needs);
     setUpSliders(data);
     objects.show(data);
     fillStrip(data);
-    const trouble = await world.show(data);
-    world.setVoxels(Number(element("occupancy").value), element("voxel-color").value);
+    world.show(data);
+    applyVoxels();
     applySwitches();
     applyScore();
     if (data.frames.length) selectFrame(0);
-    await Promise.all([...element("strip").querySelectorAll("img")].slice(0, 12).map((image) => image.decode().catch(() => {})));
-    world.draw();
+    const trouble = await world.addMeshes();
+    if (turn !== opened) return;
+    applyScore();
+    await world.drawn();
     const missing = data.frames.length ? "" : "frames and voxels are not in this folder: predict again with viewer=true";
     say(trouble ?? missing, Boolean(trouble));
-    document.documentElement.dataset.ready = String(Math.round(performance.now() - (number === first ? 0 : started)));
+    document.documentElement.dataset.ready = String(Math.round(performance.now() - started));
   } catch (error) {
     say(error.message, true);
     throw error;
@@ -145,7 +156,7 @@ function selectFrame(index) {
 }
 
 async function selectVoxel(point) {
-  const volume = point && state.data.volumes.find((some) => some.reads && voxelAt(some, point));
+  const volume = point && ownerOf(state.data.volumes.filter((some) => some.reads), point);
   if (!volume) {
     element("voxel").textContent = "There is no mesh and no occupied voxel: lower the threshold of voxels, or choose another place.";
     return;
@@ -158,7 +169,7 @@ async function selectVoxel(point) {
   const size = volume.extent.map((length, axis) => length / volume.resolution[axis]);
   world.selectVoxel(voxelCenter(volume, index), size, shares);
   markStrip(shares);
-  element("voxel").textContent = describe(volume, index, flat, reads, shares);
+  element("voxel").textContent = describe(volume, index, reads, shares);
   if (shares.length) selectFrame(shares[0].frame);
   refreshOverlay();
 }
@@ -178,9 +189,11 @@ function markStrip(shares) {
   }
 }
 
-function describe(volume, index, flat, reads, shares) {
-  const occupied = volume.occupancy ? `, occupied ${(volume.occupancy[flat] / 255).toFixed(2)}` : "";
-  const seen = volume.seen ? `, seen by ${volume.seen[flat]} of ${volume.frames.length} views` : "";
+function describe(volume, index, reads, shares) {
+  const shown = ownerOf(state.data.volumes.filter((some) => some.occupancy), voxelCenter(volume, index));
+  const at = shown && flatIndex(shown, voxelAt(shown, voxelCenter(volume, index)));
+  const occupied = shown ? `, occupied ${(shown.occupancy[at] / 255).toFixed(2)}` : "";
+  const seen = shown?.seen ? `, seen by ${shown.seen[at]} of ${shown.frames.length} views` : "";
   const where = `Voxel (${index.join(", ")})${occupied}${seen}. `;
   if (!reads.length) return `${where}No ray meets it: it read nothing.`;
   const { frame, share } = shares[0];
@@ -195,7 +208,7 @@ element("occupancy").addEventListener("input", applyVoxels);
 element("voxel-color").addEventListener("change", applyVoxels);
 element("previous").addEventListener("click", () => selectFrame(state.frame - 1));
 element("next").addEventListener("click", () => selectFrame(state.frame + 1));
-element("fly").addEventListener("click", () => world.fly(state.data.frames[state.frame]));
+element("fly").addEventListener("click", () => world.fly());
 element("home").addEventListener("click", () => world.home());
 element("scenes").addEventListener("change", (event) => open(Number(event.target.value)));
 document.addEventListener("keydown", (event) => {
@@ -204,14 +217,8 @@ document.addEventListener("keydown", (event) => {
   if (event.key === "ArrowRight") selectFrame(state.frame + 1);
 });
 
-const first = 0;
 const names = await (await fetch("scenes.json")).json();
 element("scenes-label").hidden = names.length < 2;
 element("scenes").replaceChildren(...names.map((name, number) => new Option(name, String(number))));
 globalThis.raytran = { world, state };
-applyVoxelsText();
-await open(first);
-
-function applyVoxelsText() {
-  element("occupancy-value").textContent = Number(element("occupancy").value).toFixed(2);
-}
+await open(0);

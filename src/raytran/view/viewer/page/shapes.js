@@ -7,8 +7,8 @@ import {
 } from "./vendor/three.js";
 import { EDGES, colorOf, corners } from "./data.js";
 
-const EDGE_WIDTH = 0.014;
-const FRONT_WIDTH = 0.035;
+const EDGE_WIDTH = 0.01;
+const FRONT_WIDTH = 0.024;
 const CAMERA_SIZE = 0.05;
 const BAR = new BoxGeometry(1, 1, 1);
 

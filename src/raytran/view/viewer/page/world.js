@@ -7,10 +7,14 @@ import {
 } from "./vendor/three.js";
 import { colorOf, corners } from "./data.js";
 import { readMeshes } from "./meshes.js";
+import { intersections } from "./picking.js";
 import { boxBars, cameraCubes, frustumLines, highest, outline, picturePlane, positionOf, segments } from "./shapes.js";
 import { Voxels } from "./voxels.js";
+import { drawsInSoftware } from "./webgl.js";
 
 const IMAGE_DEPTH = 0.4;
+const BACKDROP_DEPTH = 15;
+const FIELD_OF_VIEW = 0.87;
 const FRUSTUM_DEPTH = 0.16;
 const CHOSEN = 0xffb000;
 const LAYERS = ["meshes", "boxes", "truth", "cameras", "picture", "voxels", "chosen"];
@@ -21,11 +25,12 @@ export class World {
     this.canvas = canvas;
     this.labels = labels;
     this.onPick = onPick;
-    this.renderer = new WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true });
-    this.camera = new PerspectiveCamera(50, 1, 0.02, 200);
+    this.renderer = new WebGLRenderer({ canvas, antialias: !drawsInSoftware() });
+    this.camera = new PerspectiveCamera(50, 1, 0.02, 500);
     this.camera.up.set(0, 0, 1);
     this.controls = new OrbitControls(this.camera, canvas);
     this.controls.addEventListener("change", () => this.redraw());
+    this.controls.addEventListener("start", () => this.#leaveBackdrop());
     this.headlight = new DirectionalLight(0xffffff, 1.6);
     this.pending = false;
     new ResizeObserver(() => this.#resize()).observe(canvas.parentElement);
@@ -42,10 +47,13 @@ export class World {
     this.objects = [];
     this.voxels = [];
     this.frames = null;
+    this.shown = null;
+    this.backdrop = false;
+    this.wanted = {};
   }
 
-  /** Show a scene as data.js read it; resolves to a sentence if its meshes could not be read, else to null. */
-  async show(data) {
+  /** Show a scene as data.js read it, its meshes later. */
+  show(data) {
     this.clear();
     this.data = data;
     for (const object of data.objects) this.#addObject(object);
@@ -54,21 +62,27 @@ export class World {
     this.voxels = data.volumes.filter((volume) => volume.occupancy).map((volume) => new Voxels(volume));
     this.layers.voxels.add(...this.voxels.map((voxels) => voxels.mesh));
     this.home();
-    let trouble = null;
+  }
+
+  /** Add the objects' meshes; resolves to a sentence if they could not be read, else to null. */
+  async addMeshes() {
+    const { data, layers } = this;
     try {
-      for (const [index, mesh] of await readMeshes(`${data.base}scene.glb`)) {
+      const meshes = await readMeshes(`${data.base}scene.glb`);
+      if (data !== this.data) return null;
+      for (const [index, mesh] of meshes) {
         const object = this.objects[index];
         if (!object) continue;
         mesh.material.color.set(colorOf(object.data.category));
         mesh.traverse((part) => { part.userData = { object: index }; });
         object.mesh = mesh;
-        this.layers.meshes.add(mesh);
+        layers.meshes.add(mesh);
       }
     } catch (error) {
-      trouble = `no meshes: ${error.message}`;
+      return `no meshes: ${error.message}`;
     }
     this.redraw();
-    return trouble;
+    return null;
   }
 
   #addObject(data) {
@@ -93,8 +107,10 @@ export class World {
 
   /** Show some layers: {meshes, boxes, labels, truth, cameras, voxels}, true or false. */
   setShown(shown) {
-    for (const name of ["meshes", "boxes", "truth", "cameras", "voxels"]) this.layers[name].visible = shown[name];
-    this.layers.picture.visible = shown.cameras;
+    this.wanted = shown;
+    for (const name of ["meshes", "boxes", "truth", "voxels"]) this.layers[name].visible = shown[name];
+    this.layers.cameras.visible = shown.cameras && !this.backdrop;
+    this.layers.picture.visible = shown.cameras || this.backdrop;
     this.labels.hidden = !shown.labels;
     this.redraw();
   }
@@ -126,9 +142,18 @@ export class World {
   selectFrame(frame, size) {
     const texture = new TextureLoader().load(frame.url, () => this.redraw());
     texture.colorSpace = SRGBColorSpace;
-    const rim = segments(frustumLines(frame, ...size, IMAGE_DEPTH), new LineBasicMaterial({ color: CHOSEN }));
+    this.shown = { frame, size, texture };
+    this.#placePicture(IMAGE_DEPTH);
+  }
+
+  #placePicture(depth) {
+    const { frame, size, texture } = this.shown;
+    const rim = segments(frustumLines(frame, ...size, depth), new LineBasicMaterial({ color: CHOSEN }));
     this.layers.picture.clear();
-    this.layers.picture.add(picturePlane(frame, size, IMAGE_DEPTH, texture), rim);
+    this.layers.picture.add(picturePlane(frame, size, depth, texture), rim);
+    this.backdrop = depth === BACKDROP_DEPTH;
+    this.layers.cameras.visible = this.wanted.cameras && !this.backdrop;
+    this.layers.picture.visible = this.wanted.cameras || this.backdrop;
     this.redraw();
   }
 
@@ -157,20 +182,33 @@ export class World {
     if (bounds.isEmpty()) bounds.set(new Vector3(-1, -1, -1), new Vector3(1, 1, 1));
     const radius = Math.max(bounds.getSize(new Vector3()).length() / 2, 0.5);
     bounds.getCenter(this.controls.target);
-    const away = radius / Math.sin((this.camera.fov * Math.PI) / 360) / Math.min(this.camera.aspect, 1);
+    this.#leaveBackdrop();
+    this.#setFieldOfView(FIELD_OF_VIEW);
+    const away = radius / Math.sin(FIELD_OF_VIEW / 2) / Math.min(this.camera.aspect, 1);
     this.camera.position.set(-0.55, -0.85, 1.0).normalize().multiplyScalar(away).add(this.controls.target);
     this.controls.update();
     this.redraw();
   }
 
-  /** Look from a frame's camera. */
-  fly(frame) {
-    const rotation = frame.world_from_camera;
-    const forward = new Vector3(rotation[0][2], rotation[1][2], rotation[2][2]);
+  /** Look from the camera of the frame that is shown, its picture behind everything until one turns away. */
+  fly() {
+    const { frame, size } = this.shown;
+    const pose = frame.world_from_camera;
+    const forward = new Vector3(pose[0][2], pose[1][2], pose[2][2]);
     this.camera.position.set(...positionOf(frame));
     this.controls.target.copy(this.camera.position).addScaledVector(forward, 1.5);
+    this.#setFieldOfView(2 * Math.atan(size[0] / 2 / frame.intrinsics[1][1]));
     this.controls.update();
-    this.redraw();
+    this.#placePicture(BACKDROP_DEPTH);
+  }
+
+  #leaveBackdrop() {
+    if (this.backdrop) this.#placePicture(IMAGE_DEPTH);
+  }
+
+  #setFieldOfView(radians) {
+    this.camera.fov = (radians * 180) / Math.PI;
+    this.camera.updateProjectionMatrix();
   }
 
   /** Where a point of the world is on the canvas, CSS pixels, or null behind the camera. */
@@ -209,6 +247,11 @@ export class World {
     });
   }
 
+  /** Resolves when what has changed is on the screen. */
+  drawn() {
+    return new Promise((done) => requestAnimationFrame(() => setTimeout(done)));
+  }
+
   draw() {
     this.headlight.position.copy(this.camera.position);
     this.headlight.target.position.copy(this.controls.target);
@@ -231,7 +274,7 @@ export class World {
     this.renderer.setSize(clientWidth, clientHeight, false);
     this.camera.aspect = clientWidth / Math.max(clientHeight, 1);
     this.camera.updateProjectionMatrix();
-    if (this.data) this.draw();
+    if (this.data) this.draw(); // at once: a canvas of a new size is empty
   }
 
   #listen() {
@@ -247,17 +290,6 @@ export class World {
       this.onPick(event.shiftKey ? this.castToVoxel(caster.ray) : this.cast(caster.ray), event.shiftKey);
     });
   }
-}
-
-/** What of some layers a ray meets, the nearest first. */
-function intersections(ray, layers) {
-  const caster = new Raycaster(ray.origin, ray.direction);
-  return caster.intersectObjects(layers, true).filter(({ object }) => object.isMesh && isShown(object));
-}
-
-function isShown(object) {
-  for (let part = object; part; part = part.parent) if (!part.visible) return false;
-  return true;
 }
 
 function readableOn(color) {
