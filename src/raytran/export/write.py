@@ -57,14 +57,8 @@ def write_prediction(
     folder.mkdir(parents=True, exist_ok=True)
     names = write_meshes(folder, objects, meshes)
     files = [write_glb(folder / "scene.glb", objects, meshes, cameras=cameras, frame_ids=frame_ids)]
-    if prediction.occupancy is not None and grid_extent is not None:
-        files.append(
-            write_occupancy(
-                folder / "occupancy.ply",
-                prediction.occupancy,
-                center=prediction.grid_center,
-                extent=grid_extent,
-            )
-        )
+    if (occupancy := prediction.occupancy) is not None and grid_extent is not None:
+        path, center = folder / "occupancy.ply", prediction.grid_center
+        files.append(write_occupancy(path, occupancy, center=center, extent=grid_extent))
     files += [folder / name for name in names if name is not None]
     return [write_scene_json(folder / "scene.json", prediction, names), *files]
