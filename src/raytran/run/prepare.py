@@ -17,6 +17,7 @@ from raytran.data.rooms.generate import generate_rooms
 from raytran.errors import ConfigError
 from raytran.run.build import plain
 from raytran.run.check import check
+from raytran.run.rooms_report import report_on_rooms
 
 _log = logging.getLogger(__name__)
 
@@ -63,7 +64,7 @@ def _rooms_v1(settings: dict[str, Any], output: Path) -> Any:
     _refuse(settings, *_CHOSEN, because=_FIXED)
     _refuse(settings, "cads", because="given CAD models go with dataset=rooms-v1-furniture")
     report = generate_rooms_v1(output, processes=settings["processes"], **_given(settings, *_COUNTS))
-    _log.info("%d rooms are in %s", sum(map(len, (report.train, report.val, report.test))), report.root)
+    _log.info("%s\nthe rooms are in %s", report_on_rooms(report.root), report.root)
     _log.info("train on them with data=rooms-v1 data.root=%s, then evaluate … split=test", output)
     return report
 
@@ -77,7 +78,7 @@ def _rooms_v1_furniture(settings: dict[str, Any], output: Path) -> Any:
     report = generate_rooms_v1_furniture(
         output, cads=Path(settings["cads"]), processes=settings["processes"], **numbers
     )
-    _log.info("%d rooms are in %s; evaluate on them with", len(report.test), report.root)
+    _log.info("%s\nthe rooms are in %s; evaluate on them with", report_on_rooms(report.root), report.root)
     _log.info("python -m raytran.evaluate checkpoint=CKPT data=scan2cad data.root=%s split=test", output)
     return report
 
