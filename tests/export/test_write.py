@@ -94,6 +94,14 @@ def test_a_mesh_or_a_name_is_missing(tmp_path, prediction, cameras):
     [
         (None, "no scene file at"),
         ("{", "cannot read"),
+        ("[" * 100_000, "cannot read"),
+        ("9" * 5000, "cannot read"),
+        ('{"format": "raytran.scene/1", "scene_id": "a", "objects": ["x"]}', "malformed"),
+        (
+            '{"format": "raytran.scene/1", "scene_id": "a", "objects": [{"category": "chair", "center": '
+            f"[1{'0' * 400}, 0, 0]" + "}]}",
+            "malformed",
+        ),
         ('{"format": "other"}', "has format 'other'"),
         ('{"format": "raytran.scene/1", "scene_id": "a", "objects": [{"category": "ship"}]}', "malformed"),
     ],

@@ -75,7 +75,7 @@ def read_scene_json(path: Path) -> ScenePrediction:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise DataError(f"no scene file at {path}; write one with `python -m raytran.predict`") from error
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"cannot read {path} as JSON ({error}); write it again") from error
     found = content.get("format") if isinstance(content, dict) else None
     if found != FORMAT:
@@ -86,7 +86,7 @@ def read_scene_json(path: Path) -> ScenePrediction:
             objects=_objects(content["objects"]),
             grid_center=torch.full((3,), torch.nan),
         )
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
         raise DataError(
             f"an object in {path} is incomplete or malformed ({error!r}); write it again"
         ) from error
