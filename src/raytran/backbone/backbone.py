@@ -8,8 +8,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from raytran.backbone.block import RayTracedBlock
-from raytran.backbone.lifting import LiftingBackbone
-from raytran.backbone.resnet import ResNet18
+from raytran.backbone.lifting import ImageEncoder, LiftingBackbone
 from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
@@ -37,7 +36,7 @@ class Backbone(LiftingBackbone):
     def __init__(
         self,
         *,
-        resnet: ResNet18,
+        resnet: ImageEncoder,
         channels: int = 256,
         num_heads: int = 8,
         num_blocks: int = 4,

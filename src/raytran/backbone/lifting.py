@@ -8,6 +8,7 @@ from abc import ABC, abstractmethod
 import torch
 from torch import Tensor, nn
 
+from raytran.backbone.efficientnet import EfficientNetLite0
 from raytran.backbone.resnet import ResNet18
 from raytran.errors import ShapeError, check_shape
 from raytran.geometry.camera import Cameras
@@ -16,6 +17,9 @@ from raytran.ops.block_pairs import BlockPairs
 from raytran.ops.center_tracer import CenterTracer
 from raytran.ops.pairs import PairList
 from raytran.ops.splat import splat_features
+
+ImageEncoder = ResNet18 | EfficientNetLite0
+"""Normalised images ``(n, 3 or 4, H, W)`` → features ``(n, out_channels, H/stride, W/stride)``."""
 
 
 class LiftingBackbone(nn.Module, ABC):
@@ -41,13 +45,13 @@ class LiftingBackbone(nn.Module, ABC):
     tracer: CenterTracer | None = None
     checkpoint_blocks: bool = False
 
-    def __init__(self, *, resnet: ResNet18, channels: int) -> None:
+    def __init__(self, *, resnet: ImageEncoder, channels: int) -> None:
         super().__init__()
         self.channels = channels
         self.resnet = resnet
         self.projection = nn.Linear(resnet.out_channels, channels)
-        # ImageNet statistics, on which torchvision's weights were trained; a mask channel is left as it is.
-        shift, scale = [0.485, 0.456, 0.406, 0.0], [0.229, 0.224, 0.225, 1.0]
+        # Those that the encoder's weights were trained on; a mask channel is left as it is.
+        shift, scale = [*resnet.image_mean, 0.0], [*resnet.image_std, 1.0]
         self.register_buffer("image_mean", torch.tensor(shift[: resnet.input_channels]), persistent=False)
         self.register_buffer("image_std", torch.tensor(scale[: resnet.input_channels]), persistent=False)
 

@@ -10,8 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from raytran.backbone.lifting import LiftingBackbone
-from raytran.backbone.resnet import ResNet18
+from raytran.backbone.lifting import ImageEncoder, LiftingBackbone
 from raytran.errors import ConfigError
 from raytran.geometry.grid import VoxelGrid
 from raytran.ops.center_tracer import CenterTracer
@@ -35,7 +34,7 @@ class UnprojectionBackbone(LiftingBackbone):
     """
 
     def __init__(
-        self, *, resnet: ResNet18, channels: int = 256, num_blocks: int = 4, num_levels: int = 3
+        self, *, resnet: ImageEncoder, channels: int = 256, num_blocks: int = 4, num_levels: int = 3
     ) -> None:
         super().__init__(resnet=resnet, channels=channels)
         if num_blocks < 1 or num_levels < 1:
