@@ -23,7 +23,7 @@ from raytran.types import CLASSES, ObjectSet
 
 SPLITS = ("train", "val", "test")
 
-MOST_LOOKED_AT = 100
+MOST_LOOKED_AT = 40
 """Scans of a split, spread evenly, of which is counted what the cameras see."""
 
 SEEN = 0.5
