@@ -60,7 +60,7 @@ def options(name: str) -> list[Option]:
     path = CONF / f"{name}.yaml"
     text = path.read_text(encoding="utf-8")
     lines = text.splitlines()
-    package = "" if "@package _global_" in text else ".".join(path.relative_to(CONF).parts[:-1])
+    package = _package(text, ".".join(path.relative_to(CONF).parts[:-1]))
     root = yaml.compose(text)
     found = [] if root is None else list(_walk(root, f"{package}." if package else "", text, lines))
     headings = [Option("", None, comment, line) for line, comment in _headings(lines)]
@@ -76,6 +76,12 @@ def header(path: Path) -> str:
         if not line.startswith("# @package"):
             words.append(line.lstrip("# "))
     return re.split(r"\.(?:\s|$)", " ".join(words), maxsplit=1)[0]
+
+
+def _package(text: str, folder: str) -> str:
+    """Return under which name the settings of a file stand: that of its folder, unless it says another."""
+    said = re.search(r"^# @package (\S+)", text, re.MULTILINE)
+    return folder if said is None else said[1].replace("_global_", "")
 
 
 def _walk(node: yaml.MappingNode, prefix: str, text: str, lines: list[str]) -> Iterator[Option]:
@@ -140,7 +146,7 @@ def _choices_table(name: str) -> list[str]:
         if not isinstance(entry, dict):
             continue
         ((key, chosen),) = entry.items()
-        group = key.split()[-1].lstrip("/")
+        group = "/".join([*Path(name).parts[:-1], key.split()[-1].lstrip("/")])
         if key.startswith("optional") or group.startswith("hydra/job_logging"):
             continue
         for path in sorted((CONF / group).glob("*.yaml")):
