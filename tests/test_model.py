@@ -306,12 +306,18 @@ def test_the_encoder_never_sees_the_new_cameras() -> None:
 def test_rendering_a_few_views_at_once_gives_the_same_images() -> None:
     model, views = make_model(), make_views(views=3)
     cameras = Cameras.of(make_views(views=5))
-    together, apart = model.render(views, cameras), model.render(views, cameras, views_at_once=2)
+    (together,), apart = model.render(views, cameras), list(model.render(views, cameras, views_at_once=2))
+    assert [len(images) for images in apart] == [2, 2, 1]
     assert not model.training
     assert together.shape == (5, 3, 32, 48)
     assert together.min() > 0
     assert together.max() < 1
-    torch.testing.assert_close(together, apart, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(together, torch.cat(apart), rtol=1e-4, atol=1e-5)
+    raw = model(views, tasks=("view",), new_cameras=cameras)
+    torch.testing.assert_close(together, model.decode(raw, ["a"])[0].new_views)
+    center = views.world_from_camera[0, :, :3, 3].mean(dim=0) + 0.5
+    (moved,) = model.render(views, cameras, grid_center=center)
+    assert not torch.allclose(moved, together, atol=1e-4)
 
 
 def test_what_rendering_needs_is_said() -> None:
@@ -320,7 +326,7 @@ def test_what_rendering_needs_is_said() -> None:
         model(views, tasks=("view",))
     odd = Cameras(views.intrinsics, views.world_from_camera, (30, 48))
     with pytest.raises(ShapeError, match="divisible by 16, got 30x48"):
-        model.render(views, odd)
+        next(model.render(views, odd))
     del model.heads["view"]
     with pytest.raises(ConfigError, match="train experiment=novel_view"):
-        model.render(views, Cameras.of(views))
+        next(model.render(views, Cameras.of(views)))

@@ -8,9 +8,9 @@ scene looks like from elsewhere (appendix A).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -118,7 +118,7 @@ class RayTran(nn.Module):
             foreground=None if pixels is None else self._foreground(pixels, views_at_once),
             objects=objects,
             proposals=proposals,
-            new_views=self._render(voxels, grid, new_cameras, views_at_once) if "view" in tasks else None,
+            new_views=self._render(voxels, grid, new_cameras) if "view" in tasks else None,
         )
 
     def _lift(
@@ -148,10 +148,8 @@ class RayTran(nn.Module):
         logits = [self.heads["foreground"](chunk) for chunk in some]
         return logits[0] if len(logits) == 1 else torch.cat(logits, dim=1)
 
-    def _render(
-        self, voxels: Tensor, grid: VoxelGrid, cameras: Cameras | None, views_at_once: int | None
-    ) -> Tensor:
-        """Run the view head, on a few cameras at a time if asked to."""
+    def _render(self, voxels: Tensor, grid: VoxelGrid, cameras: Cameras | None) -> Tensor:
+        """Run the view head."""
         if "view" not in self.heads or cameras is None:
             missing = "new_cameras" if "view" in self.heads else "a view head: train experiment=novel_view"
             raise ConfigError(f"rendering new views needs {missing}")
@@ -159,13 +157,9 @@ class RayTran(nn.Module):
         height, width = cameras.image_size
         if height % stride or width % stride:
             raise ShapeError(f"expected new cameras with sides divisible by {stride}, got {height}x{width}")
-        size, count = (height // stride, width // stride), cameras.intrinsics.shape[1]
-        step = views_at_once or max(count, 1)
-        logits = []
-        for some in (cameras.select(slice(start, start + step)) for start in range(0, count, step)):
-            pairs = self.ray_tracer(some, grid, size, self.rays_per_cell)
-            logits.append(self.heads["view"](voxels, some, grid, pairs))
-        return logits[0] if len(logits) == 1 else torch.cat(logits, dim=1)
+        # Along the rays, also where the backbone reads its features in another way.
+        pairs = self.ray_tracer(cameras, grid, (height // stride, width // stride), self.rays_per_cell)
+        return self.heads["view"](voxels, cameras, grid, pairs)
 
     def decode_shapes(self, embedding: Tensor) -> Tensor:
         """Return shape logits ``(M, S, S, S)`` of query embeddings ``(M, C)``."""
@@ -210,24 +204,37 @@ class RayTran(nn.Module):
         return replace(found, seen=self._count_views(views, found.grid_center))
 
     @torch.no_grad()
-    def render(self, views: Views, cameras: Cameras, *, views_at_once: int | None = None) -> Tensor:
-        """Render one scene (B = 1) from new cameras. Puts the network in eval mode.
+    def render(
+        self,
+        views: Views,
+        cameras: Cameras,
+        *,
+        views_at_once: int | None = None,
+        grid_center: Tensor | None = None,
+    ) -> Iterator[Tensor]:
+        """Render one scene (B = 1) from new cameras, a few at a time. Puts the network in eval mode.
 
         Args:
             views: posed images, batch dimension 1.
             cameras: of leading shape ``(1, V)``, in the world of ``views``, their sides divisible by the
                 encoder's stride.
             views_at_once: views, old or new, that pass through the network together, None for all.
+            grid_center: ``(3,)`` centre of the voxel grid, metres; None: the mean camera position.
 
-        Returns:
-            ``(V, 3, H, W)`` red, green and blue in [0, 1].
+        Yields:
+            ``(n, 3, H, W)`` red, green and blue in [0, 1] of the next cameras.
 
         Raises:
             ConfigError: the network has no view head.
         """
         self.eval()
-        raw = self(views, tasks=("view",), views_at_once=views_at_once, new_cameras=cameras)
-        return cast("Tensor", raw.new_views)[0].float().sigmoid()
+        seen, count = Cameras.of(views), cameras.intrinsics.shape[1]
+        center = seen.position.mean(dim=1) if grid_center is None else grid_center[None]
+        grid = VoxelGrid(self.grid_resolution, self.grid_extent, center)
+        voxels, _ = self._lift(views.images, seen, grid, False, views_at_once)
+        for start in range(0, count, views_at_once or max(count, 1)):
+            some = cameras.select(slice(start, start + (views_at_once or count)))
+            yield self._render(voxels, grid, some)[0].float().sigmoid()
 
     @torch.no_grad()
     def decode(

@@ -105,6 +105,7 @@ def config(folder, output, **changes) -> DictConfig:
         "score_threshold": 0.5,
         "duplicate_iou": 0.5,
         "num_overlays": 2,
+        "views": None,
         "turntable": 2,
         "cads": None,
         "views_at_once": 4,

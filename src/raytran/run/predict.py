@@ -11,14 +11,16 @@ from omegaconf import DictConfig
 
 from raytran.data.importers.open import open_scene
 from raytran.data.importers.orient import WorldSettings
+from raytran.data.shapenet import shapenet_version
 from raytran.errors import ConfigError
 from raytran.model import RayTran
 from raytran.postprocess import object_meshes
-from raytran.run.checkpoint import load_model, prediction_settings
+from raytran.run.checkpoint import PredictionSettings, load_model, prediction_settings
 from raytran.run.device import choose_device
 from raytran.run.output import check_replaceable
+from raytran.run.render_views import cameras_to_render, render_views
 from raytran.run.scene_files import MARKER, PredictedScene, write_scene
-from raytran.run.volumes import Limits, check_choice, predict_room, predict_volume, read_room
+from raytran.run.volumes import Limits, RoomViews, check_choice, predict_room, predict_volume, read_room
 from raytran.types import Views
 
 _LOG = logging.getLogger(__name__)
@@ -26,6 +28,7 @@ _LOG = logging.getLogger(__name__)
 _UNTRAINED = {
     "occupancy": "its objects mean nothing yet; predict with a checkpoint of stage shape",
     "joint": "its meshes mean nothing yet; predict with a checkpoint of stage shape",
+    "view": "it renders new views; its objects mean nothing unless stage.trainable left the backbone alone",
 }
 """Stage of the curriculum that is not the last → what to expect of its checkpoints."""
 
@@ -48,20 +51,15 @@ def predict(cfg: DictConfig) -> Path:
     world = WorldSettings(up=cfg.up, scale=cfg.scale, convention=cfg.convention, check=cfg.check)
     check_choice(cfg.frames, cfg.num_views)
     check_replaceable(output.resolve(), marker=MARKER)
+    if cfg.cads:
+        shapenet_version(Path(cfg.cads))  # It raises where there are none, before the network runs.
     settings = prediction_settings(cfg.checkpoint)
     if settings.stage in _UNTRAINED:
         _LOG.warning("%s is of stage %s: %s", cfg.checkpoint, settings.stage, _UNTRAINED[settings.stage])
     model = load_model(cfg.checkpoint).to(choose_device(cfg.device))
     _check_channels(model, cfg.checkpoint)
-    with open_scene(scene, format=cfg.format, settings=world) as scan:
-        room = read_room(
-            scan,
-            frames=cfg.frames,
-            num_views=cfg.num_views or settings.num_views,
-            image_size=settings.image_size,
-            resolution=model.grid_resolution,
-            extent=model.grid_extent,
-        )
+    new_cameras = cameras_to_render(cfg.views, model, cfg.checkpoint)
+    room = _read(cfg, world, settings, model)
     prediction = predict_room(
         model,
         room,
@@ -71,6 +69,8 @@ def predict(cfg: DictConfig) -> Path:
         views_at_once=cfg.views_at_once,
     )
     found = PredictedScene(prediction, object_meshes(prediction))
+    if cfg.cads:
+        found = found.with_cads(Path(cfg.cads))
     write_scene(
         output,
         found,
@@ -78,7 +78,10 @@ def predict(cfg: DictConfig) -> Path:
         room.frame_ids,
         grid_extent=room.volumes.joint().extent,
         num_overlays=cfg.num_overlays,
+        turntable=cfg.turntable,
     )
+    if new_cameras is not None:
+        render_views(model, room, new_cameras, output, views_at_once=cfg.views_at_once)
     _report(output, found)
     return output
 
@@ -96,6 +99,19 @@ def predict_scene(model: RayTran, views: Views, **limits: Unpack[Limits]) -> Pre
     """
     prediction = predict_volume(model, views, **limits)
     return PredictedScene(prediction, object_meshes(prediction))
+
+
+def _read(cfg: DictConfig, world: WorldSettings, settings: PredictionSettings, model: RayTran) -> RoomViews:
+    """Return the frames that the network is given, and its volumes."""
+    with open_scene(Path(cfg.scene).resolve(), format=cfg.format, settings=world) as scan:
+        return read_room(
+            scan,
+            frames=cfg.frames,
+            num_views=cfg.num_views or settings.num_views,
+            image_size=settings.image_size,
+            resolution=model.grid_resolution,
+            extent=model.grid_extent,
+        )
 
 
 def _check_channels(model: RayTran, checkpoint: str) -> None:
@@ -116,4 +132,4 @@ def _report(output: Path, found: PredictedScene) -> None:
             "%s: no object has a score above the threshold; lower score_threshold to see weaker ones",
             found.prediction.scene_id,
         )
-    _LOG.info("wrote %s: scene.json, scene.glb, meshes/, topdown.png, overlays/", output.resolve())
+    _LOG.info("wrote %s: %s", output.resolve(), ", ".join(sorted(path.name for path in output.iterdir())))
