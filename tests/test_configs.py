@@ -26,6 +26,7 @@ GIVEN_BY_CODE = {
         *("root", "split", "num_views", "view_choice", "targets", "augmentation"),
     },
     "raytran.run.rooms.ensure_rooms": {"output"},
+    "raytran.run.rooms.ensure_rooms_v1": {"output"},
 }
 # Part of the layout that scan2cad_dataset stands for.
 FIXED_BY_LAYOUT = {"scans_root", "scene_ids", "annotations", "shapenet_root"}
@@ -71,9 +72,17 @@ def arguments(path):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("data", [("data=rooms",), ("data=scan2cad", "data.root=somewhere")])
-def test_keys_are_arguments(preset, data):
-    config = plain(train_config(f"preset={preset}", *data))
+@pytest.mark.parametrize(
+    "chosen",
+    [
+        ("data=rooms",),
+        ("data=rooms-v1",),
+        ("data=scan2cad", "data.root=somewhere"),
+        ("model=unprojection",),
+    ],
+)
+def test_keys_are_arguments(preset, chosen):
+    config = plain(train_config(f"preset={preset}", *chosen))
     nodes = list(nodes_with_target(config))
     assert len(nodes) > 10
     for node in nodes:
@@ -148,6 +157,31 @@ def test_every_experiment_resolves_with_every_preset(preset, experiment):
 def test_small_networks_are_built(preset):
     model = build_model(train_config(f"preset={preset}"))
     assert set(model.heads) == {"occupancy", "foreground", "objects", "shape"}
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize(
+    "chosen", ["model=unprojection", "experiment=unprojection_stage2", "model/backbone=unprojection"]
+)
+def test_the_baseline_has_the_presets_sizes(preset, chosen):
+    baseline, network = (plain(train_config(f"preset={preset}", *more))["model"] for more in ([chosen], []))
+    kinds = [model["backbone"].pop("_target_") for model in (baseline, network)]
+    assert kinds == [
+        "raytran.backbone.unprojection.UnprojectionBackbone",
+        "raytran.backbone.backbone.Backbone",
+    ]
+    assert baseline["backbone"].pop("num_levels") == 3
+    for of_attention in ("num_heads", "expansion", "checkpoint_blocks"):
+        del network["backbone"][of_attention]
+    assert baseline == network
+
+
+def test_the_baseline_takes_about_as_many_parameters():
+    attention, baseline = (
+        sum(parameter.numel() for parameter in build_model(train_config("preset=small", *more)).parameters())
+        for more in ([], ["model=unprojection"])
+    )
+    assert 1.0 < baseline / attention < 1.2
 
 
 def test_one_word_chooses_a_preset_and_typing_wins():

@@ -29,6 +29,7 @@ ROOTS = {
 """What a root needs besides its defaults, if anything."""
 
 
+PARTS_OF_THE_MODEL = ("model/backbone", "model/encoder", "model/size")
 OF_EVALUATION = ("frames_", "objects_")
 
 
@@ -64,7 +65,7 @@ def test_no_folder_is_forgotten():
     folders = {str(path.parent) for path in FILES} - {"local"}
     assert folders == {
         *(".", "data", "debug", "experiment", "logger", "loss", "model", "preset", "stage", "sweep"),
-        *("trainer", "hydra/launcher", "hydra/sweeper"),
+        *("trainer", "hydra/launcher", "hydra/sweeper", *PARTS_OF_THE_MODEL),
     }
 
 
@@ -73,7 +74,7 @@ def test_roots(path):
     OmegaConf.resolve(compose(path.name, ROOTS.get(path.name, [])))
 
 
-@pytest.mark.parametrize("path", files("model", "loss", "stage"), ids=name)
+@pytest.mark.parametrize("path", files("model", *PARTS_OF_THE_MODEL, "loss", "stage"), ids=name)
 def test_parts(path):
     build_everything(chosen(path))
 

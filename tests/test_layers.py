@@ -19,7 +19,8 @@ LAYERS: list[set[str]] = [
     {"export", "view"},
     {"training"},
     {"run"},
-    {"train", "curriculum", "evaluate", "predict", "prepare", "plan", "demo", "replay", "report"},
+    {"train", "curriculum", "evaluate", "predict", "prepare", "plan", "demo", "replay", "report", "__main__"}
+    | {"export_model"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 NEEDS_TRAINING = {"lightning", "hydra", "wandb"}
@@ -33,6 +34,8 @@ def sources(root: Path) -> list[Path]:
 
 
 def layer_of(path: Path, root: Path) -> str:
+    if path.name == "__main__.py":  # what `python -m raytran.<folder>` runs is an entry point
+        return "__main__"
     return path.relative_to(root / "src" / "raytran").parts[0].removesuffix(".py")
 
 

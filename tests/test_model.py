@@ -8,20 +8,25 @@ import pytest
 import torch
 
 from raytran.backbone.backbone import Backbone
+from raytran.backbone.block import Stream
 from raytran.backbone.resnet import ResNet18
 from raytran.errors import ConfigError, ShapeError
+from raytran.geometry.camera import Cameras
 from raytran.geometry.rotation import yaw_from_rotation
 from raytran.heads.foreground import ForegroundHead
 from raytran.heads.objects import ObjectHead
 from raytran.heads.occupancy import OccupancyHead
 from raytran.heads.shape import ShapeHead
+from raytran.heads.view import ViewHead
 from raytran.losses.matcher import HungarianMatcher
 from raytran.losses.total import TotalLoss
 from raytran.model import TASKS, RayTran
 from raytran.types import ObjectSet, RawObjects, RawScene, SceneBatch, Views
 
 RESOLUTION, EXTENT, CHANNELS = (6, 6, 4), (6.0, 6.0, 3.0), 16
-WEIGHTS = dict.fromkeys(("occupancy", "foreground", "class", "center", "size", "yaw", "heat", "shape"), 1.0)
+WEIGHTS = dict.fromkeys(
+    ("occupancy", "foreground", "class", "center", "size", "yaw", "heat", "shape", "view"), 1.0
+)
 
 
 def make_model(
@@ -44,6 +49,11 @@ def make_model(
             grid_extent=EXTENT,
         ),
         "shape": ShapeHead(channels=CHANNELS, widths=(8, 8, 4, 4)),
+        "view": ViewHead(
+            stream=Stream(channels=CHANNELS, num_heads=2, expansion=1, direction="voxels_to_pixels"),
+            channels=CHANNELS,
+            widths=widths,
+        ),
     }
     resnet = ResNet18(width=4, stride=stride, input_channels=input_channels)
     backbone = Backbone(resnet=resnet, channels=CHANNELS, num_heads=2, num_blocks=2, expansion=1)
@@ -164,13 +174,17 @@ def test_sides_must_be_divisible_by_16() -> None:
         (("occupancy",), ("occupancy",)),
         (TASKS, TASKS),
         ((*TASKS, "shape"), (*TASKS, "shape")),
+        (("view",), ("view",)),
+        (("occupancy", "view"), ("occupancy", "view")),
     ],
 )
 def test_every_parameter_in_use_gets_a_gradient_and_no_other(
     trained: tuple[str, ...], terms: tuple[str, ...]
 ) -> None:
     model, views = make_model(), make_views()
-    raw = model(views, tasks=[name for name in trained if name in TASKS])
+    new_views = make_views(views=3)
+    tasks = [name for name in trained if name != "shape"]
+    raw = model(views, tasks=tasks, new_cameras=Cameras.of(new_views))
     batch = SceneBatch(
         ("a",),
         views,
@@ -179,6 +193,7 @@ def test_every_parameter_in_use_gets_a_gradient_and_no_other(
         objects=(make_objects(3),),
         occupancy=torch.rand(1, *RESOLUTION) > 0.5,
         foreground=torch.rand(1, 2, 32, 48) > 0.5,
+        new_views=new_views,
     )
     loss = TotalLoss(weights=WEIGHTS, matcher=HungarianMatcher(weights=WEIGHTS))
     loss(raw, batch, terms=terms, decode_shapes=model.decode_shapes)["total"].backward()
@@ -264,3 +279,54 @@ def test_stride_8_and_proposed_queries() -> None:
     assert len(model.predict(make_views(), with_shapes=False).objects) == 5
     with pytest.raises(ConfigError, match="one width for each halving"):
         make_model(stride=8)
+
+
+def test_the_encoder_never_sees_the_new_cameras() -> None:
+    """Neither what the view head is given of the scene nor any other task depends on what is rendered."""
+    model, views = make_model().eval(), make_views(scenes=2)
+    given: list[torch.Tensor] = []
+    model.heads["view"].register_forward_pre_hook(lambda _, inputs: given.append(inputs[0]))
+
+    def run(new_cameras: Cameras) -> RawScene:
+        return model(views, tasks=(*TASKS, "view"), new_cameras=new_cameras)
+
+    here, there = (Cameras.of(make_views(scenes=2, views=count)) for count in (1, 4))
+    moved = there.world_from_camera.clone()
+    moved[..., :3, 3] += torch.tensor([0.7, -1.0, 0.3])
+    first, second = run(here), run(Cameras(1.3 * there.intrinsics, moved, (64, 32)))
+    assert torch.equal(given[0], given[1])
+    assert torch.equal(first.grid_center, second.grid_center)
+    assert torch.equal(first.occupancy, second.occupancy)
+    assert torch.equal(first.foreground, second.foreground)
+    assert torch.equal(first.objects[-1].center, second.objects[-1].center)
+    assert first.new_views.shape == (2, 1, 3, 32, 48)
+    assert second.new_views.shape == (2, 4, 3, 64, 32)
+
+
+def test_rendering_a_few_views_at_once_gives_the_same_images() -> None:
+    model, views = make_model(), make_views(views=3)
+    cameras = Cameras.of(make_views(views=5))
+    (together,), apart = model.render(views, cameras), list(model.render(views, cameras, views_at_once=2))
+    assert [len(images) for images in apart] == [2, 2, 1]
+    assert not model.training
+    assert together.shape == (5, 3, 32, 48)
+    assert together.min() > 0
+    assert together.max() < 1
+    torch.testing.assert_close(together, torch.cat(apart), rtol=1e-4, atol=1e-5)
+    raw = model(views, tasks=("view",), new_cameras=cameras)
+    torch.testing.assert_close(together, model.decode(raw, ["a"])[0].new_views)
+    center = views.world_from_camera[0, :, :3, 3].mean(dim=0) + 0.5
+    (moved,) = model.render(views, cameras, grid_center=center)
+    assert not torch.allclose(moved, together, atol=1e-4)
+
+
+def test_what_rendering_needs_is_said() -> None:
+    model, views = make_model().eval(), make_views()
+    with pytest.raises(ConfigError, match="needs new_cameras"):
+        model(views, tasks=("view",))
+    odd = Cameras(views.intrinsics, views.world_from_camera, (30, 48))
+    with pytest.raises(ShapeError, match="divisible by 16, got 30x48"):
+        next(model.render(views, odd))
+    del model.heads["view"]
+    with pytest.raises(ConfigError, match="train experiment=novel_view"):
+        next(model.render(views, Cameras.of(views)))

@@ -8,10 +8,15 @@ import pytest
 import torch
 
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.postprocess import object_meshes, select_objects
+from raytran.geometry.volumes import Volumes
+from raytran.postprocess import count_object_views, merge_volumes, object_meshes, select_objects
 from raytran.types import ObjectSet, ScenePrediction
 
 SIZE = 16
+TWO = Volumes(
+    (8, 8, 4), (8.0, 8.0, 4.0), torch.tensor([[0.0, 0.0, 0.0], [6.0, 0.0, 0.0]], dtype=torch.float64)
+)
+"""Volumes that share 2 ≤ x ≤ 4; the border is at x = 3."""
 
 
 def prediction(label, center, score, *, size=(1.0, 1.0, 1.0), yaw=0.0, shape=None) -> ScenePrediction:
@@ -84,3 +89,103 @@ def test_bool_shapes_of_the_truth_are_accepted():
     shape[0, 2:6] = True
     (mesh,) = object_meshes(prediction([0], [0.0, 0, 0], [1.0], shape=shape))
     assert mesh.volume == pytest.approx(0.25, rel=0.03)
+
+
+def test_views_of_an_object_are_the_mean_over_its_box():
+    seen = torch.zeros(4, 4, 4, dtype=torch.int32)
+    seen[2:] = 10
+    scene = prediction(
+        [0, 0, 0, 0],
+        [[1.0, 0, 0], [0, 0, 0], [-1.0, 0, 0], [2.0, 0, 0]],
+        [1.0] * 4,
+        size=(1.0, 1.0, 1.0),
+    )
+    objects = count_object_views(replace(scene, seen=seen), grid_extent=(4.0, 4.0, 4.0))
+    # Wholly where ten looked, half, not, and half out of the volume.
+    assert objects.num_views.tolist() == [10, 5, 0, 5]
+    assert count_object_views(scene, grid_extent=(4.0, 4.0, 4.0)).num_views is None
+    none = replace(scene, objects=ObjectSet.empty(), seen=seen)
+    assert len(count_object_views(none, grid_extent=(4.0, 4.0, 4.0)).num_views) == 0
+    # Turned by 90°, a long box lies along y.
+    long = prediction([0], [0.0, 0, 0], [1.0], size=(4.0, 0.1, 0.1), yaw=np.pi / 2)
+    seen = torch.arange(4, dtype=torch.int32)[None, :, None].expand(4, 4, 4)
+    objects = count_object_views(replace(long, seen=seen), grid_extent=(4.0, 4.0, 4.0))
+    assert objects.num_views.tolist() == [1.5]
+
+
+def merged(first, second, **changes) -> ScenePrediction:
+    """Merge two predictions, each a list of (label, x, score)."""
+    parts = [
+        prediction([o[0] for o in part], [[o[1], 0.0, 0.0] for o in part], [o[2] for o in part], **changes)
+        for part in (first, second)
+    ]
+    return merge_volumes(parts, TWO)
+
+
+def found(scene: ScenePrediction) -> list[tuple[int, float, float]]:
+    objects = scene.objects
+    return [
+        (int(label), round(float(center[0]), 3), round(float(score), 3))
+        for label, center, score in zip(objects.label, objects.center, objects.score, strict=True)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "expected"),
+    [
+        # Each alone in its own volume.
+        ([(0, 0.0, 0.9)], [(0, 6.0, 0.8)], [(0, 0.0, 0.9), (0, 6.0, 0.8)]),
+        # Seen by both: the volume counts in which it lies nearer to the middle, not the higher score.
+        ([(0, 2.5, 0.6)], [(0, 2.45, 0.9)], [(0, 2.5, 0.6)]),
+        ([(0, 3.6, 0.9)], [(0, 3.5, 0.7)], [(0, 3.5, 0.7)]),
+        # On the border each sees it on its own side: once, the surer.
+        ([(0, 2.95, 0.6)], [(0, 3.05, 0.9)], [(0, 3.05, 0.9)]),
+        # On the border each sees it on the other's side: not lost.
+        ([(0, 3.05, 0.9)], [(0, 2.95, 0.6)], [(0, 3.05, 0.9)]),
+        # Only the farther volume found it, well across the border: it is not believed.
+        ([(0, 3.8, 0.9)], [], []),
+        # Of two classes in one place the owner's counts.
+        ([(5, 3.1, 0.9)], [(6, 3.15, 0.6)], [(6, 3.15, 0.6)]),
+        # Two things side by side at the border are two.
+        ([(0, 2.4, 0.9)], [(0, 3.5, 0.8)], [(0, 2.4, 0.9), (0, 3.5, 0.8)]),
+        ([], [], []),
+    ],
+)
+def test_each_object_of_two_volumes_comes_once(first, second, expected):
+    assert found(merged(first, second)) == expected
+
+
+def test_shapes_and_views_come_along():
+    shape = torch.rand(2, 4, 4, 4)
+    parts = [
+        prediction([0], [[0.0, 0, 0]], [0.5], shape=shape[:1]),
+        prediction([1], [[6.0, 0, 0]], [0.9], shape=shape[1:]),
+    ]
+    parts = [
+        replace(part, objects=replace(part.objects, num_views=torch.tensor([float(n)])))
+        for n, part in enumerate(parts)
+    ]
+    objects = merge_volumes(parts, TWO).objects
+    assert torch.equal(objects.shape, shape.flip(0))
+    assert objects.num_views.tolist() == [1.0, 0.0]
+
+
+def test_voxels_come_from_the_volume_whose_middle_is_nearest():
+    first, second = torch.rand(8, 8, 4), torch.rand(8, 8, 4)
+    scene = prediction([], [], [])
+    parts = [replace(scene, occupancy=first), replace(scene, occupancy=second)]
+    whole = merge_volumes(parts, TWO)
+    joint = TWO.joint()
+    assert whole.occupancy.shape == joint.resolution == (14, 8, 4)
+    assert whole.grid_center.tolist() == [3.0, 0.0, 0.0]
+    assert torch.equal(whole.occupancy[:7], first[:7])
+    assert torch.equal(whole.occupancy[7:], second[1:])
+    assert whole.seen is None
+    # A corner that no volume holds stays empty.
+    angle = Volumes((8, 8, 4), (8.0, 8.0, 4.0), torch.tensor([[0.0, 0, 0], [6.0, 0, 0], [6.0, 6.0, 0]]))
+    ones = [replace(scene, seen=torch.ones(8, 8, 4, dtype=torch.int32))] * 3
+    seen = merge_volumes(ones, angle).seen
+    assert seen.dtype == torch.int32
+    assert seen.shape == (14, 14, 4)
+    assert seen[:6, 8:].sum() == 0
+    assert seen.sum() == (14 * 14 - 6 * 6) * 4

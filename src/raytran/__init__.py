@@ -13,14 +13,15 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 
-def load(checkpoint: str | Path) -> RayTran:
+def load(checkpoint: str | Path = "default") -> RayTran:
     """Return the model of a checkpoint, in evaluation mode, on the CPU.
 
     Args:
-        checkpoint: a ``.ckpt`` file that training wrote.
+        checkpoint: a ``.ckpt`` file that training wrote, a ``.safetensors`` file that was exported from one,
+            or ``default`` for the weights that the package carries (``raytran/weights/README.md``).
 
     Raises:
-        CheckpointError: the file is missing or damaged.
+        CheckpointError: the file is missing or damaged, or the package was built without weights.
     """
     # Imported here so that ``import raytran`` stays light.
     from raytran.run.checkpoint import load_model

@@ -2,20 +2,22 @@
 """RayTran: posed images of a room → its objects, with class, pose and shape (Tyszkiewicz et al., ECCV 2022).
 
 This is the page to read first. The backbone lifts the images into a voxel grid (§3.1); heads read the
-result (§3.2): what is occupied, what is foreground in each view, and which objects there are.
+result (§3.2): what is occupied, what is foreground in each view, and which objects there are; or what the
+scene looks like from elsewhere (appendix A).
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from raytran.backbone.backbone import Backbone
 from raytran.backbone.chunked import run_in_chunks
-from raytran.errors import ConfigError
+from raytran.backbone.lifting import LiftingBackbone
+from raytran.errors import ConfigError, ShapeError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.heads.slots import objects_of_slots
@@ -23,12 +25,21 @@ from raytran.ops.block_pairs import BlockPairs
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_tracer import RayTracer
 from raytran.ops.traverse import count_views
-from raytran.types import ObjectSet, RawScene, ScenePrediction, Views
+from raytran.types import ObjectSet, RawScene, SceneBatch, ScenePrediction, Views
 
 TASKS = ("occupancy", "foreground", "objects")
-"""What ``forward`` can be asked for; shapes are decoded afterwards, for chosen queries only."""
+"""What ``forward`` is asked for by default; shapes are decoded afterwards, for chosen queries only."""
 
 SHAPES_AT_ONCE = 16
+
+
+def inputs_of(batch: SceneBatch) -> dict[str, Any]:
+    """Return what ``RayTran.forward`` is given of a batch; of the new views that is their cameras alone."""
+    return {
+        "views": batch.views,
+        "grid_center": batch.grid_center,
+        "new_cameras": None if batch.new_views is None else Cameras.of(batch.new_views),
+    }
 
 
 class RayTran(nn.Module):
@@ -36,30 +47,31 @@ class RayTran(nn.Module):
 
     Args:
         backbone: images and pixel-voxel pairs → voxel and pixel features.
-        heads: ``occupancy``, ``foreground``, ``objects`` and ``shape``, or those of them that are needed.
+        heads: ``occupancy``, ``foreground``, ``objects``, ``shape`` and ``view``, or those that are needed.
         grid_resolution: ``(X, Y, Z)`` voxels.
         grid_extent: sizes of the voxel grid, metres.
         rays_per_cell: n×n rays join a cell of the feature map with the voxels they cross.
 
     Raises:
-        ConfigError: the foreground head does not grow the features back to image size.
+        ConfigError: the foreground or view head does not grow the features back to image size.
     """
 
     def __init__(
         self,
         *,
-        backbone: Backbone,
+        backbone: LiftingBackbone,
         heads: Mapping[str, nn.Module],
         grid_resolution: Sequence[int] = (48, 48, 16),
         grid_extent: Sequence[float] = (9.0, 9.0, 3.5),
         rays_per_cell: int = 2,
     ) -> None:
         super().__init__()
-        if "foreground" in heads and heads["foreground"].stride != backbone.stride:
-            raise ConfigError(
-                f"the foreground head grows features {heads['foreground'].stride}× and the encoder's stride "
-                f"is {backbone.stride}: give it one width for each halving but the last"
-            )
+        for name in ("foreground", "view"):
+            if name in heads and heads[name].stride != backbone.stride:
+                raise ConfigError(
+                    f"the {name} head grows features {heads[name].stride}× and the encoder's stride is "
+                    f"{backbone.stride}: give it one width for each halving but the last"
+                )
         self.backbone = backbone
         self.heads = nn.ModuleDict(heads)
         self.grid_resolution = (int(grid_resolution[0]), int(grid_resolution[1]), int(grid_resolution[2]))
@@ -74,25 +86,28 @@ class RayTran(nn.Module):
         tasks: Collection[str] = TASKS,
         grid_center: Tensor | None = None,
         views_at_once: int | None = None,
+        new_cameras: Cameras | None = None,
     ) -> RawScene:
         """Run the backbone once and the heads of ``tasks``.
 
         Args:
             views: posed images of B scenes.
-            tasks: some of ``TASKS``.
+            tasks: some of ``TASKS`` and ``view``.
             grid_center: ``(B, 3)`` centres of the voxel grids, metres; by default the mean camera position.
             views_at_once: views that pass through the network together, so that memory hardly grows with
                 their number; for prediction only. None: all of them.
+            new_cameras: what ``view`` renders, of leading shape ``(B, V)``; no other task sees them.
 
         Returns:
             Raw predictions, None for what was not asked for.
 
         Raises:
-            ConfigError: ``views_at_once`` is fewer than the views in training mode, or not positive.
+            ConfigError: ``views_at_once`` is fewer than the views in training mode, or not positive; or
+                ``view`` is asked for without new cameras, or of a network without that head.
             ShapeError: image sides are not divisible by the encoder's stride, or tensors do not have the
                 documented shapes.
         """
-        cameras = Cameras(views.intrinsics, views.world_from_camera, views.image_size)
+        cameras = Cameras.of(views)
         center = cameras.position.mean(dim=1) if grid_center is None else grid_center
         grid = VoxelGrid(self.grid_resolution, self.grid_extent, center)
         voxels, pixels = self._lift(views.images, cameras, grid, "foreground" in tasks, views_at_once)
@@ -103,6 +118,7 @@ class RayTran(nn.Module):
             foreground=None if pixels is None else self._foreground(pixels, views_at_once),
             objects=objects,
             proposals=proposals,
+            new_views=self._render(voxels, grid, new_cameras) if "view" in tasks else None,
         )
 
     def _lift(
@@ -113,7 +129,7 @@ class RayTran(nn.Module):
         def trace(some: Cameras) -> PairList | BlockPairs:
             stride = self.backbone.stride
             size = (images.shape[-2] // stride, images.shape[-1] // stride)
-            return self.ray_tracer(some, grid, size, self.rays_per_cell)
+            return (self.backbone.tracer or self.ray_tracer)(some, grid, size, self.rays_per_cell)
 
         if views_at_once is None or views_at_once >= images.shape[1]:
             return self.backbone(images, cameras, grid, trace(cameras), with_pixels=with_pixels)
@@ -131,6 +147,19 @@ class RayTran(nn.Module):
         some = pixels.split(views_at_once or pixels.shape[1], dim=1)
         logits = [self.heads["foreground"](chunk) for chunk in some]
         return logits[0] if len(logits) == 1 else torch.cat(logits, dim=1)
+
+    def _render(self, voxels: Tensor, grid: VoxelGrid, cameras: Cameras | None) -> Tensor:
+        """Run the view head."""
+        if "view" not in self.heads or cameras is None:
+            missing = "new_cameras" if "view" in self.heads else "a view head: train experiment=novel_view"
+            raise ConfigError(f"rendering new views needs {missing}")
+        stride = self.backbone.stride
+        height, width = cameras.image_size
+        if height % stride or width % stride:
+            raise ShapeError(f"expected new cameras with sides divisible by {stride}, got {height}x{width}")
+        # Along the rays, also where the backbone reads its features in another way.
+        pairs = self.ray_tracer(cameras, grid, (height // stride, width // stride), self.rays_per_cell)
+        return self.heads["view"](voxels, cameras, grid, pairs)
 
     def decode_shapes(self, embedding: Tensor) -> Tensor:
         """Return shape logits ``(M, S, S, S)`` of query embeddings ``(M, C)``."""
@@ -175,6 +204,39 @@ class RayTran(nn.Module):
         return replace(found, seen=self._count_views(views, found.grid_center))
 
     @torch.no_grad()
+    def render(
+        self,
+        views: Views,
+        cameras: Cameras,
+        *,
+        views_at_once: int | None = None,
+        grid_center: Tensor | None = None,
+    ) -> Iterator[Tensor]:
+        """Render one scene (B = 1) from new cameras, a few at a time. Puts the network in eval mode.
+
+        Args:
+            views: posed images, batch dimension 1.
+            cameras: of leading shape ``(1, V)``, in the world of ``views``, their sides divisible by the
+                encoder's stride.
+            views_at_once: views, old or new, that pass through the network together, None for all.
+            grid_center: ``(3,)`` centre of the voxel grid, metres; None: the mean camera position.
+
+        Yields:
+            ``(n, 3, H, W)`` red, green and blue in [0, 1] of the next cameras.
+
+        Raises:
+            ConfigError: the network has no view head.
+        """
+        self.eval()
+        seen, count = Cameras.of(views), cameras.intrinsics.shape[1]
+        center = seen.position.mean(dim=1) if grid_center is None else grid_center[None]
+        grid = VoxelGrid(self.grid_resolution, self.grid_extent, center)
+        voxels, _ = self._lift(views.images, seen, grid, False, views_at_once)
+        for start in range(0, count, views_at_once or max(count, 1)):
+            some = cameras.select(slice(start, start + (views_at_once or count)))
+            yield self._render(voxels, grid, some)[0].float().sigmoid()
+
+    @torch.no_grad()
     def decode(
         self,
         raw: RawScene,
@@ -191,6 +253,7 @@ class RayTran(nn.Module):
                 grid_center=raw.grid_center[scene],
                 occupancy=None if raw.occupancy is None else raw.occupancy[scene].float().sigmoid(),
                 foreground=None if raw.foreground is None else raw.foreground[scene].float().sigmoid(),
+                new_views=None if raw.new_views is None else raw.new_views[scene].float().sigmoid(),
             )
             for scene, scene_id in enumerate(scene_ids)
         )

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a prediction to the objects one shows: a score threshold, duplicates, meshes."""
+"""From predictions to the objects one shows: score threshold, duplicates, joined volumes, views, meshes."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +15,19 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 
 from raytran.geometry.boxes import OrientedBoxes, box_iou
+from raytran.geometry.grid import VoxelGrid
+from raytran.geometry.volumes import Volumes
 from raytran.types import ObjectSet, ScenePrediction
+
+_POINTS_PER_SIDE = 4
+"""A box is sampled at so many points along each side to see how many views saw it."""
+
+_SAME_IOU, _SAME_PLACE_IOU = 0.25, 0.5
+"""Objects of two volumes whose boxes overlap by more than this IoU are one: the first if they are of one
+class, the second whatever they are."""
+
+_NEARLY_OWN = 0.25
+"""How far on another volume's side of the border an object still counts, if nothing else is there, metres."""
 
 
 def select_objects(
@@ -40,10 +54,111 @@ def _first_of_duplicates(objects: ObjectSet, duplicate_iou: float) -> Tensor:
     """Return where an object is no duplicate of an earlier one that is kept, ``(M,)`` bool."""
     boxes = OrientedBoxes(objects.center, objects.size, objects.rotation)
     duplicates = (box_iou(boxes, boxes)[0] > duplicate_iou) & (objects.label[:, None] == objects.label)
-    keep = torch.ones_like(objects.label, dtype=torch.bool)
-    for index in range(len(objects)):
+    return _first_of(duplicates)
+
+
+def _first_of(duplicates: Tensor) -> Tensor:
+    """Return where none that is kept comes earlier and is a duplicate, ``(M,)`` bool, of ``(M, M)`` bool."""
+    keep = torch.ones(len(duplicates), dtype=torch.bool)
+    for index in range(len(duplicates)):
         keep[index] = not bool((duplicates[index, :index] & keep[:index]).any())
     return keep
+
+
+def count_object_views(prediction: ScenePrediction, *, grid_extent: tuple[float, float, float]) -> ObjectSet:
+    """Return the objects with the number of views that saw their boxes, the mean over points in each box.
+
+    Args:
+        prediction: with ``seen``; places outside the voxel grid count as unseen.
+        grid_extent: sizes of the voxel grid, metres.
+    """
+    objects, seen = prediction.objects, prediction.seen
+    if seen is None:
+        return objects
+    side = (torch.arange(_POINTS_PER_SIDE) + 0.5) / _POINTS_PER_SIDE - 0.5
+    local = torch.cartesian_prod(side, side, side).to(objects.size) * objects.size[:, None]
+    points = local @ objects.rotation.transpose(1, 2) + objects.center[:, None]
+    x, y, z = seen.shape
+    grid = VoxelGrid((x, y, z), grid_extent, prediction.grid_center.to(points))
+    voxel = grid.voxel_from_world(points.flatten(0, 1)).floor().long()
+    inside = ((voxel >= 0) & (voxel < torch.tensor(seen.shape))).all(dim=1)
+    counts = torch.zeros(len(voxel))
+    counts[inside] = seen.flatten()[grid.flat_index(voxel[inside])].float()
+    return replace(objects, num_views=counts.view(len(objects), _POINTS_PER_SIDE**3).mean(dim=1))
+
+
+def merge_volumes(predictions: Sequence[ScenePrediction], volumes: Volumes) -> ScenePrediction:
+    """Return one prediction of a room that was predicted in several overlapping volumes, each object once.
+
+    An object belongs to the volume whose middle is nearest to its centre, and so does each voxel. One that
+    another volume found just across the border stays if no other object is there, so that none falls
+    between two.
+
+    Args:
+        predictions: one for each of the T volumes, on the CPU.
+        volumes: where they are.
+
+    Returns:
+        the objects, highest score first, and ``occupancy`` and ``seen`` over ``volumes.joint()``; no
+        ``foreground``, which is of other frames in each volume.
+    """
+    parts = [prediction.objects for prediction in predictions]
+    volume = torch.cat([torch.full((len(part),), index) for index, part in enumerate(parts)])
+    objects = _join(parts)
+    owned = volumes.owner(objects.center) == volume
+    to_middle = volumes.center[volume] - objects.center
+    moved = objects.center + to_middle.clamp(-_NEARLY_OWN, _NEARLY_OWN)
+    candidate = owned | (volumes.owner(moved) == volume)
+    # A volume's own objects come first, then by score.
+    order = torch.argsort(objects.score + 2 * owned, descending=True, stable=True)
+    order = order[candidate[order]]
+    objects, volume = objects.select(order), volume[order]
+    objects = objects.select(_first_of(_same_thing(objects) & (volume[:, None] != volume)))
+    return ScenePrediction(
+        scene_id=predictions[0].scene_id,
+        objects=objects.select(objects.score.argsort(descending=True, stable=True)),
+        grid_center=volumes.joint().center.to(predictions[0].grid_center),
+        occupancy=_join_voxels([prediction.occupancy for prediction in predictions], volumes),
+        seen=_join_voxels([prediction.seen for prediction in predictions], volumes),
+    )
+
+
+def _same_thing(objects: ObjectSet) -> Tensor:
+    """Return which objects of different volumes are one and the same, ``(M, M)`` bool."""
+    boxes = OrientedBoxes(objects.center, objects.size, objects.rotation)
+    iou, _ = box_iou(boxes, boxes)
+    same_class = objects.label[:, None] == objects.label
+    return same_class & (iou > _SAME_IOU) | (iou > _SAME_PLACE_IOU)
+
+
+def _join(parts: Sequence[ObjectSet]) -> ObjectSet:
+    """Return the objects of several sets, without models, in one."""
+    some = [part for part in parts if len(part)] or list(parts[:1])
+    columns: dict[str, Any] = {"model_id": ()}
+    for name in {field.name for field in fields(ObjectSet)} - columns.keys():
+        values = [getattr(part, name) for part in some]
+        columns[name] = None if any(value is None for value in values) else torch.cat(values)
+    return ObjectSet(**columns)
+
+
+def _join_voxels(values: Sequence[Tensor | None], volumes: Volumes) -> Tensor | None:
+    """Return values ``(X, Y, Z)`` of each volume over the joint grid; 0 where there is none."""
+    present = [value for value in values if value is not None]
+    if len(present) < len(volumes):
+        return None
+    joint, one = volumes.joint(), VoxelGrid(volumes.resolution, volumes.extent, torch.zeros(3))
+    size = torch.tensor(volumes.extent)
+    from_middle = (one.voxel_centers() / size).square().sum(dim=-1)
+    result = present[0].new_zeros(joint.resolution)
+    nearest = torch.full(joint.resolution, torch.inf)
+    for value, corner in zip(present, volumes.corner_index().tolist(), strict=True):
+        place = tuple(
+            slice(start, start + count) for start, count in zip(corner, volumes.resolution, strict=True)
+        )
+        closer = from_middle < nearest[place]
+        result[place] = torch.where(closer, value, result[place])
+        nearest[place] = torch.where(closer, from_middle, nearest[place])
+    return result
 
 
 def object_meshes(prediction: ScenePrediction) -> list[trimesh.Trimesh | None]:

@@ -85,6 +85,11 @@ class Views(Parcel):
         """``(H, W)`` of the images."""
         return self.images.shape[-2], self.images.shape[-1]
 
+    def colors(self) -> Tensor:
+        """Return red, green and blue in [0, 1], ``(B, N, 3, H, W)`` in floating point."""
+        rgb = self.images[:, :, :3]
+        return rgb if rgb.is_floating_point() else rgb.float() / 255
+
 
 @dataclass(frozen=True)
 class ObjectSet(Parcel):
@@ -199,6 +204,7 @@ class SceneBatch(Parcel):
         objects: the annotated objects of each scene.
         occupancy: ``(B, X, Y, Z)`` bool, voxel holds part of an object.
         foreground: ``(B, N, H, W)`` bool, amodal mask of all objects together.
+        new_views: other posed images of the scenes, to be rendered from ``views``.
     """
 
     scene_id: tuple[str, ...]
@@ -208,6 +214,7 @@ class SceneBatch(Parcel):
     objects: tuple[ObjectSet, ...] | None = None
     occupancy: Tensor | None = None
     foreground: Tensor | None = None
+    new_views: Views | None = None
 
 
 @dataclass(frozen=True)
@@ -258,6 +265,7 @@ class RawScene(Parcel):
         foreground: ``(B, N, H, W)`` logits.
         objects: one ``RawObjects`` per decoder layer, last layer last.
         proposals: where the queries of ``objects`` come from; None if they are learned.
+        new_views: ``(B, V, 3, H, W)`` logits of red, green and blue.
     """
 
     grid_center: Tensor
@@ -265,6 +273,7 @@ class RawScene(Parcel):
     foreground: Tensor | None = None
     objects: tuple[RawObjects, ...] | None = None
     proposals: RawProposals | None = None
+    new_views: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -278,6 +287,7 @@ class ScenePrediction(Parcel):
         occupancy: ``(X, Y, Z)`` probability, or None.
         foreground: ``(N, H, W)`` probability, or None.
         seen: ``(X, Y, Z)`` int32, how many views have a ray through each voxel, or None.
+        new_views: ``(V, 3, H, W)`` rendered colours in [0, 1], or None.
     """
 
     scene_id: str
@@ -286,3 +296,4 @@ class ScenePrediction(Parcel):
     occupancy: Tensor | None = None
     foreground: Tensor | None = None
     seen: Tensor | None = None
+    new_views: Tensor | None = None

@@ -303,3 +303,41 @@ def test_real_walk_without_annotation(shared_dir, tmp_path) -> None:
     )
     assert dataset.scene_ids == ("hololens_000",)
     assert dataset[0].views.images.shape == (1, 2, 3, 120, 160)
+
+
+def test_frames_to_render_are_apart_from_those_to_see(long_dataset) -> None:
+    """Views, masks, names and the volume's centre are of the frames that are seen alone."""
+    options = {"num_views": 5, "num_new_views": 3, "targets": ("foreground",), "view_choice": "even"}
+    sample = open_dataset(long_dataset, **options)[0]
+    assert sample.views.images.shape[:2] == sample.foreground.shape[:2] == (1, 5)
+    assert len(sample.frame_id[0]) == 5
+    assert sample.new_views.images.shape == (1, 3, 3, 32, 48)
+    plain = open_dataset(long_dataset, **options | {"num_views": 8, "num_new_views": 0})[0]
+    places = [plain.frame_id[0].index(name) for name in sample.frame_id[0]]
+    others = [place for place in range(8) if place not in places]
+    assert torch.equal(sample.views.images, plain.views.images[:, places])
+    assert torch.equal(sample.new_views.images, plain.views.images[:, others])
+    assert torch.equal(sample.new_views.world_from_camera, plain.views.world_from_camera[:, others])
+    assert torch.equal(sample.foreground, plain.foreground[:, places])
+    positions = sample.views.world_from_camera[:, :, :3, 3]
+    torch.testing.assert_close(sample.grid_center, positions.mean(dim=1))
+
+
+def test_frames_to_render_change_with_the_epoch_and_with_the_scene(long_dataset) -> None:
+    augmentation = Augmentation(yaw_deg=180, mirror=1.0)
+    options = {"num_views": 4, "num_new_views": 2, "targets": (), "augmentation": augmentation}
+    dataset = open_dataset(long_dataset, **options)
+    first, again = dataset[0], dataset[0]
+    assert torch.equal(first.new_views.world_from_camera, again.new_views.world_from_camera)
+    dataset.set_epoch(1)
+    assert not torch.equal(first.new_views.world_from_camera, dataset[0].new_views.world_from_camera)
+    batch = collate_scenes([dataset[0], dataset[1]])
+    assert batch.new_views.images.shape[:2] == (2, 2)
+    # The cameras of a scan stand on a line, and still do after one change of the whole scene.
+    line = torch.cat([first.views.world_from_camera, first.new_views.world_from_camera], dim=1)[0, :, :3, 3]
+    assert torch.linalg.svdvals(line - line.mean(dim=0))[1] < 1e-4
+
+
+def test_too_few_frames_to_hold_some_out(cube_dataset) -> None:
+    with pytest.raises(DataError, match="can be read and 6 are needed"):
+        open_dataset(cube_dataset, num_views=4, num_new_views=4, targets=())[0]

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import logging
+import struct
+import zlib
 
 import numpy as np
 import pytest
@@ -144,3 +146,17 @@ def test_none_readable(paths) -> None:
 def test_stored_size_is_height_and_width(paths) -> None:
     paths[0].write_bytes(b"no image")
     assert stored_size(paths) == (8, 16)
+
+
+@pytest.mark.parametrize("side", [9_000, 100_000])
+def test_an_image_that_claims_too_many_pixels_is_not_decoded(tmp_path, side) -> None:
+    """A few bytes, whose header promises a picture that would fill the memory."""
+    Image.new("RGB", (16, 8)).save(tmp_path / "a.png")
+    content = bytearray((tmp_path / "a.png").read_bytes())
+    content[16:24] = struct.pack(">II", side, side)
+    content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
+    (tmp_path / "a.png").write_bytes(content)
+    with pytest.raises(DataError, match=r"claims 9000x9000 pixels, and at most 8192|exceeds limit"):
+        read_image(tmp_path / "a.png", (8, 16))
+    with pytest.raises(DataError, match=r"pixels, and at most 8192|can be read"):
+        stored_size([tmp_path / "a.png"])

@@ -97,9 +97,10 @@ def test_files_that_cannot_be_used(tmp_path, write_annotations, cube_entry) -> N
     with pytest.raises(DataError, match=r"nothing\.json"):
         read_annotations(tmp_path / "nothing.json")
     broken = tmp_path / "broken.json"
-    broken.write_text('[{"id_scan": ')
-    with pytest.raises(DataError, match="not valid JSON"):
-        read_annotations(broken)
+    for text in ('[{"id_scan": ', "[" * 100_000):
+        broken.write_text(text)
+        with pytest.raises(DataError, match="not valid JSON"):
+            read_annotations(broken)
     broken.write_text('{"scene": 1}')
     with pytest.raises(DataError, match="not a list of scenes"):
         read_annotations(broken)
@@ -107,6 +108,7 @@ def test_files_that_cannot_be_used(tmp_path, write_annotations, cube_entry) -> N
         cube_entry(sym="mirror"),
         cube_entry(bbox=[1, 2]),
         cube_entry(translation=(math.nan, 0, 0)),
+        cube_entry(translation=(10**400, 0, 0)),
     ):
         with pytest.raises(DataError, match=r"entry 1 of .*full_annotations\.json"):
             read_annotations(write_annotations({"a": [cube_entry()], "b": [entry]}))

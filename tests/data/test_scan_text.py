@@ -33,6 +33,14 @@ def test_matrices(tmp_path, text, expected) -> None:
         np.testing.assert_array_equal(matrix, expected)
 
 
+def test_a_file_without_end_is_not_read_whole(tmp_path) -> None:
+    with (tmp_path / "a.txt").open("wb") as file:
+        file.write(b"colorWidth = 640\n")
+        file.truncate(1 << 42)
+    assert read_matrix(tmp_path / "a.txt") is None
+    assert read_header(tmp_path / "a.txt")["colorWidth"] == "640"
+
+
 def test_no_file_is_no_matrix(tmp_path) -> None:
     assert read_matrix(tmp_path / "nowhere.txt") is None
     assert read_matrix(tmp_path) is None

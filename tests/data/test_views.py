@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import torch
 
-from raytran.data.views import choose_even, choose_random
+from raytran.data.views import choose_even, choose_random, hold_out
 
 
 def test_random_frames_are_different_and_in_order(generator) -> None:
@@ -40,3 +40,21 @@ def test_even_frames_are_the_middles_of_equal_parts() -> None:
     assert choose_even(5, 5).tolist() == [0, 1, 2, 3, 4]
     assert choose_even(2, 4).tolist() == [0, 0, 1, 1]
     assert choose_even(1, 3).tolist() == [0, 0, 0]
+
+
+def test_held_out_frames_are_none_of_those_seen(generator) -> None:
+    used = list(range(3, 43, 4))
+    for source in (None, generator):
+        seen, rendered = hold_out(used, 3, source)
+        assert sorted([*seen, *rendered]) == list(range(10))
+        assert len(rendered) == 3
+    assert hold_out(used, 3, None)[1] == [1, 5, 8]
+    assert hold_out(used, 2, generator) != hold_out(used, 2, generator)
+
+
+def test_a_held_out_frame_that_came_twice_is_not_seen_either(generator) -> None:
+    used = [0, 0, 1, 1, 2, 2, 5]
+    for source in (None, generator):
+        seen, rendered = hold_out(used, 2, source)
+        assert (len(seen), len(rendered)) == (5, 2)
+        assert not {used[place] for place in seen} & {used[place] for place in rendered}

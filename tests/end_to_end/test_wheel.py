@@ -43,7 +43,8 @@ def test_the_wheel_is_what_runs(site: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "command", ["train", "curriculum", "evaluate", "predict", "prepare", "demo", "replay", "report"]
+    "command",
+    ["train", "curriculum", "evaluate", "predict", "prepare", "demo", "replay", "report", "export_model"],
 )
 def test_commands_find_their_configs(site: Path, tmp_path: Path, command: str) -> None:
     shown = run(site, tmp_path, "-m", f"raytran.{command}", "--cfg", "job")
@@ -70,3 +71,9 @@ def test_rooms_are_made_where_the_user_is(site: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["report.html.j2", "runs.html.j2", "doctor.html.j2", "page.css"])
 def test_the_page_templates_are_inside(name: str, site: Path) -> None:
     assert (site / "raytran" / "view" / "templates" / name).is_file()
+
+
+def test_the_folder_of_weights_is_inside(site: Path, project_root: Path) -> None:
+    folder = project_root / "src" / "raytran" / "weights"
+    expected = {path.name for path in folder.iterdir()}
+    assert {path.name for path in (site / "raytran" / "weights").iterdir()} == expected

@@ -5,7 +5,9 @@ import math
 
 import torch
 
-from raytran.geometry.position import position_code
+from raytran.geometry.camera import Cameras
+from raytran.geometry.grid import VoxelGrid
+from raytran.geometry.position import position_code, ray_code
 
 
 def test_lowest_wave_spans_twice_the_volume_and_highest_a_sixteenth() -> None:
@@ -24,3 +26,16 @@ def test_any_number_of_channels() -> None:
     code = position_code(torch.randn(2, 5, 3), (1.0, 1.0, 1.0), 64)
     assert code.shape == (2, 5, 64)
     assert not code[..., 60:].any()
+
+
+def test_rays_are_told_from_the_grids_centre_with_unit_direction() -> None:
+    pose = torch.eye(4).repeat(1, 2, 1, 1)  # looks along +z
+    pose[0, :, :3, 3] = torch.tensor([[1.0, 2.0, 3.0], [4.0, 2.0, 3.0]])
+    intrinsics = torch.tensor([[30.0, 0, 24], [0, 30, 24], [0, 0, 1]]).expand(1, 2, 3, 3)
+    grid = VoxelGrid((4, 4, 4), (4.0, 4.0, 4.0), torch.tensor([[1.0, 0.0, 0.0]]))
+    code = ray_code(Cameras(intrinsics, pose, (48, 48)), grid, (3, 3))
+    assert code.shape == (2, 3, 3, 6)
+    torch.testing.assert_close(code[1, 1, 1], torch.tensor([3.0, 2.0, 3.0, 0.0, 0.0, 1.0]))
+    # The corner cell's centre is 16 pixels left and up of the middle.
+    corner = torch.nn.functional.normalize(torch.tensor([-16.0, -16.0, 30.0]), dim=0)
+    torch.testing.assert_close(code[0, 0, 0], torch.cat([torch.tensor([0.0, 2.0, 3.0]), corner]))

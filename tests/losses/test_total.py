@@ -24,6 +24,7 @@ WEIGHTS = {
     "size": 3.0,
     "yaw": 4.0,
     "heat": 1.0,
+    "view": 1.0,
     "shape": 5.0,
 }
 VIEWS = Views(torch.zeros(1, 1, 3, 4, 4), torch.eye(3)[None, None], torch.eye(4)[None, None])

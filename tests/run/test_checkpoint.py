@@ -97,3 +97,27 @@ def test_a_checkpoint_cannot_run_foreign_code(saved):
 def test_importing_the_package_is_light():
     code = "import sys, raytran; raise SystemExit(any(name in sys.modules for name in ('torch', 'hydra')))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_a_part_that_begins_keeps_its_own_weights_where_the_parent_has_none(config, saved):
+    path, parent = saved
+    changed = compose(
+        "train",
+        ["preset=tiny", "model.grid_resolution=[8,8,4]", "experiment=novel_view", "output_dir=unused"],
+    )
+    torch.manual_seed(1)
+    model = build_model(changed)
+    fresh = {name: value.clone() for name, value in model.heads["view"].state_dict().items()}
+    content = torch.load(path, weights_only=True)
+    with pytest.raises(CheckpointError, match=r"heads\.view"):
+        load_weights(model, content, path)
+    load_weights(model, content, path, begins=["heads.view"])
+    assert all(torch.equal(value, model.heads["view"].state_dict()[name]) for name, value in fresh.items())
+    assert torch.equal(model.backbone.unseen, parent.backbone.unseen)
+    # A checkpoint that has the part gives it; one that has only some of it is damaged.
+    content["state_dict"] |= {f"model.heads.view.{name}": value + 1 for name, value in fresh.items()}
+    load_weights(model, content, path, begins=["heads.view"])
+    assert torch.equal(model.heads["view"].ray_norm.weight, fresh["ray_norm.weight"] + 1)
+    del content["state_dict"]["model.heads.view.ray_norm.weight"]
+    with pytest.raises(CheckpointError, match="ray_norm"):
+        load_weights(model, content, path, begins=["heads.view"])

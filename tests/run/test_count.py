@@ -75,6 +75,23 @@ def test_every_part_costs_something(counted: dict[str, Work]) -> None:
     assert all(work.operations > 0 and work.bytes > 0 for work in counted.values())
 
 
+def test_the_convolutions_of_the_baseline_by_hand() -> None:
+    model = build_model(compose("train", ["preset=tiny", "model=unprojection", "output_dir=x"]))
+    load = Load(2, 6, (96, 128), pairs_per_pixel=30.0, fused=False)
+    with FakeTensorMode():
+        network = fake_copy(model).eval().requires_grad_(False)
+        pairs = load.fake_pairs(network)
+        parts = {part.name: part for part in step_parts(network, load.fake_views(3), pairs)}
+        volume = count_part(parts["3D convolutions"], network, pairs, element_bytes=4, training=False)
+        assert count_part(parts["traversal"], network, pairs, element_bytes=4).bytes == 16 * len(pairs)
+    assert not any("→" in name for name in parts)
+    voxels, channels = 2 * 24 * 24 * 12, 48
+    finest = 2 * 2 * 27 * voxels  # two blocks of two convolutions
+    down = (27 + 27 + 1) * (voxels / 8 + voxels / 64)
+    up = 27 * (voxels / 8 + voxels / 64)  # a transposed convolution works on what comes in
+    assert volume.operations == 2 * channels**2 * (finest + down + up)
+
+
 def test_parts_leave_out_heads_that_do_not_run() -> None:
     model = build_model(compose("train", ["preset=tiny", "output_dir=x"]))
     with FakeTensorMode():

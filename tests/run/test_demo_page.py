@@ -57,7 +57,7 @@ def scene(split: str, scene_id: str, output) -> ShownScene:
     folder = output / "predictions" / scene_id
     extent = (6.0, 6.0, 3.0)
     found = PredictedScene(prediction, [None])
-    write_scene(folder, found, views, batch.frame_id[0], grid_extent=extent, truth=objects)
+    write_scene(folder, found, views, batch.frame_id[0], grid_extent=extent, turntable=0, truth=objects)
     return ShownScene(split, folder, batch, prediction, extent)
 
 

@@ -32,6 +32,10 @@ def parent(name, **scores):
         ("stage2", parent("occupancy", occupancy__iou=0.2)),
         ("stage2", parent("joint")),  # more of the same
         ("stage3", Parent("p.ckpt", "joint", 9, {"val/objects/f1_0.25": 0.01})),
+        ("novel_view", parent("occupancy")),
+        ("novel_view", parent("joint")),
+        ("novel_view", parent("shape")),
+        ("novel_view", parent("view")),
     ],
 )
 def test_a_parent_that_knows_its_task_will_do(experiment, found):
@@ -56,6 +60,7 @@ def test_a_parent_that_knows_its_task_will_do(experiment, found):
         ),
         ("stage3", parent("occupancy", occupancy__iou=0.9), "builds on joint: train experiment=stage2 first"),
         ("stage3", Parent("p.ckpt", "joint", 9, {"val/objects/f1_0.25": 0.0}), "has not learned objects"),
+        ("stage2", parent("view"), "is of stage view, but stage joint builds on occupancy"),
     ],
 )
 def test_others_are_refused_unless_forced(experiment, found, message, caplog):

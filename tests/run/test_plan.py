@@ -68,6 +68,13 @@ def test_a_plan(caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[
     assert "training in 16-mixed" in " ".join(capsys.readouterr().out.split())
 
 
+def test_a_plan_without_attention_has_no_blocks_to_compute_twice() -> None:
+    small = ["model.grid.resolution=[12,12,6]", "data.views=4", "views.image_size=[64,96]"]
+    needs = plan(compose("plan", [*FAST, "gpu=16GB", "model=unprojection", *small]))
+    assert [x.setting for x in needs if x.job == "train"] == ["everything kept"]
+    assert min(x.memory for x in needs) > 0
+
+
 def test_a_plan_from_the_cameras_of_a_scan(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     scan = make_scan(tmp_path / "room")
     with caplog.at_level(logging.INFO):

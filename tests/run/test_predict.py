@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -28,16 +29,24 @@ class Oracle(nn.Module):
     """Finds two chairs in the same place, and a weak table; the first chair's shape is a full box."""
 
     grid_extent = (8.0, 8.0, 4.0)
+    grid_resolution = (4, 4, 2)
 
     def __init__(self) -> None:
         super().__init__()
         self.weight = nn.Parameter(torch.zeros(1))
+        self.backbone = SimpleNamespace(resnet=SimpleNamespace(input_channels=3))
         self.seen: Views | None = None
 
     def predict(
-        self, views: Views, *, scene_id: str, score_threshold: float, views_at_once: int | None
+        self,
+        views: Views,
+        *,
+        scene_id: str,
+        score_threshold: float,
+        views_at_once: int | None,
+        grid_center: torch.Tensor | None,
     ) -> ScenePrediction:
-        self.seen, self.views_at_once = views, views_at_once
+        self.seen, self.views_at_once, self.grid_center = views, views_at_once, grid_center
         center = torch.tensor([[0.5, 3.0, 0.5], [0.55, 3.0, 0.5], [-1.0, 3.0, 0.4]])
         objects = ObjectSet(
             label=torch.tensor([3, 3, 6]),
@@ -49,7 +58,9 @@ class Oracle(nn.Module):
             shape=torch.stack([torch.ones(9, 9, 9), torch.ones(9, 9, 9), torch.zeros(9, 9, 9)]),
         )
         chosen = objects.select(objects.score >= score_threshold)
-        return ScenePrediction(scene_id, chosen, torch.zeros(3), occupancy=torch.rand(4, 4, 2))
+        counts = torch.full((4, 4, 2), views.images.shape[1], dtype=torch.int32)
+        occupancy = torch.rand(4, 4, 2)
+        return ScenePrediction(scene_id, chosen, torch.zeros(3), occupancy=occupancy, seen=counts)
 
 
 @pytest.fixture
@@ -89,10 +100,14 @@ def config(folder, output, **changes) -> DictConfig:
         "scale": None,
         "convention": "auto",
         "check": True,
+        "frames": "coverage",
         "num_views": None,
         "score_threshold": 0.5,
         "duplicate_iou": 0.5,
         "num_overlays": 2,
+        "views": None,
+        "turntable": 2,
+        "cads": None,
         "views_at_once": 4,
         "device": "cpu",
     }
@@ -110,6 +125,8 @@ def test_all_files_are_written(scene, oracle, tmp_path):
     assert {path.name for path in output.iterdir()} == {
         "scene.json",
         "scene.glb",
+        "occupancy.ply",
+        "turntable.gif",
         "meshes",
         "topdown.png",
         "overlays",
@@ -125,8 +142,22 @@ def test_views_follow_the_checkpoint_and_come_once(scene, oracle, tmp_path):
     assert oracle.views_at_once == 4
     assert oracle.seen.intrinsics[0, 0, 0].tolist() == pytest.approx([70 * 0.8, 0, 32])
     assert oracle.seen.world_from_camera[0, :, 0, 3].tolist() == pytest.approx([0.0, 0.1, 0.3, 0.4])
+    assert oracle.grid_center is None
     module.predict(config(scene, tmp_path / "out", num_views=2))
     assert oracle.seen.images.shape[1] == 2
+
+
+def test_frames_are_chosen_by_coverage_unless_told(scene, oracle, tmp_path, caplog):
+    caplog.set_level("INFO")
+    # A sixth frame stands where the last one does: as many as are asked for, but nothing new.
+    for part, ending in (("color", "jpg"), ("pose", "txt")):
+        (scene / part / f"25.{ending}").write_bytes((scene / part / f"20.{ending}").read_bytes())
+    module.predict(config(scene, tmp_path / "out"))
+    assert oracle.seen.world_from_camera[0, :, 0, 3].tolist() == pytest.approx([0.0, 0.1, 0.3, 0.4])
+    assert "chose 4 of 5 frames" in caplog.text
+    assert "left out 1 near-duplicates and 0 that are blurred" in caplog.text
+    module.predict(config(scene, tmp_path / "out", frames="even"))
+    assert oracle.seen.world_from_camera[0, :, 0, 3].tolist() == pytest.approx([0.0, 0.1, 0.3, 0.4, 0.4])
 
 
 @pytest.mark.parametrize("form", ["cpp", "odam", "mmdetection3d", "frames_25k", "sens"])
@@ -174,6 +205,8 @@ def test_nothing_found_is_a_result_and_is_said(scene, oracle, tmp_path, caplog):
     ("changes", "error", "message"),
     [
         ({"format": "kitti"}, ConfigError, "unknown format=kitti: choose one of auto, scannet"),
+        ({"frames": "sharp"}, ConfigError, "unknown frames=sharp: choose one of coverage, even"),
+        ({"num_views": 0}, ConfigError, "num_views=0 leaves no frame: give 1 or more"),
         ({"device": "abacus"}, ConfigError, "cannot use device=abacus"),
         ({"scene": "nowhere"}, DataError, "nowhere"),
     ],
@@ -181,6 +214,13 @@ def test_nothing_found_is_a_result_and_is_said(scene, oracle, tmp_path, caplog):
 def test_mistakes_are_one_sentence_and_leave_nothing(scene, oracle, tmp_path, changes, error, message):
     with pytest.raises(error, match=message):
         module.predict(config(scene, tmp_path / "out", **changes))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_network_that_wants_masks_is_for_evaluate(scene, oracle, tmp_path):
+    oracle.backbone.resnet.input_channels = 4
+    with pytest.raises(ConfigError, match=r"a\.ckpt was trained with the true masks .* raytran\.evaluate"):
+        module.predict(config(scene, tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 

@@ -68,7 +68,22 @@ def test_commands_of_the_documentation_compose(project_root):
     ("typed", "said"),
     [
         ((), "output= is missing"),
-        (("dataset=scannet", "output=x"), "choose one of rooms, scan2cad, cads"),
+        (("output=x", "num_test=3"), "leave out num_test=: dataset=rooms has no test rooms"),
+        (("dataset=rooms-v1", "output=x", "seed=1", "frames=9"), "leave out seed=, frames="),
+        (("dataset=rooms-v1", "output=x", "image_size=[120,160]"), "leave out image_size="),
+        (("dataset=rooms-v1", "output=x", "cads=y"), "dataset=rooms-v1-furniture"),
+        (("dataset=rooms-v1", "output=x", "num_val=1001"), "0 to 1000 rooms, got num_val=1001"),
+        (
+            ("dataset=rooms-v1", "output=x", "num_train=0", "num_val=0", "num_test=0"),
+            "no rooms are asked for",
+        ),
+        (("dataset=rooms-v1-furniture", "output=x"), "cads= is missing"),
+        (("dataset=rooms-v1-furniture", "output=x", "cads=y", "num_val=1"), "has test rooms only"),
+        (("dataset=rooms-v1-furniture", "output=x", "cads=y", "min_objects=1"), "leave out min_objects="),
+        (
+            ("dataset=scannet", "output=x"),
+            "choose one of rooms, rooms-v1, rooms-v1-furniture, scan2cad, cads",
+        ),
         (("dataset=scan2cad", "output=x"), "scannet= is missing"),
         (("dataset=cads", "output=x"), "source= is missing"),
         (("dataset=scan2cad", "scannet=a", "scan2cad=b", "output=x"), "give shapenet="),

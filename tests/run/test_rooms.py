@@ -7,14 +7,17 @@ import logging
 import pytest
 
 from raytran.run import rooms
-from raytran.run.rooms import ensure_rooms
+from raytran.run.build import build_data
+from raytran.run.entry import compose
+from raytran.run.rooms import ensure_rooms, ensure_rooms_v1
 
 
 @pytest.fixture
 def made(monkeypatch):
     """Record the calls of the generator instead of making rooms."""
     calls = []
-    monkeypatch.setattr(rooms, "generate_rooms", lambda output, **settings: calls.append(settings))
+    for name in ("generate_rooms", "generate_rooms_v1"):
+        monkeypatch.setattr(rooms, name, lambda output, **settings: calls.append(settings))
     return calls
 
 
@@ -47,3 +50,25 @@ def test_an_interrupted_set_is_completed(tmp_path, made):
     write_set(tmp_path, ("a", "b"), present=("a",))
     ensure_rooms(tmp_path, num_train=1, num_val=1)
     assert len(made) == 1
+
+
+def test_a_whole_benchmark_is_used_and_a_smaller_one_is_completed(tmp_path, made):
+    write_set(tmp_path, ("a", "b"), present=("a", "b", "c"))
+    asked = {"num_train": 1, "num_val": 1, "num_test": 1}
+    ensure_rooms_v1(tmp_path, **asked)
+    assert len(made) == 1  # the list of test rooms is missing
+    (tmp_path / "scannet" / "scannetv2_test.txt").write_text("c\n")
+    for count in (0, 1):
+        ensure_rooms_v1(tmp_path, **(asked | {"num_test": count}))
+    assert len(made) == 1
+    ensure_rooms_v1(tmp_path, **(asked | {"num_test": 2}))
+    assert made[1:] == [asked | {"num_test": 2, "processes": 0, "progress": True}]
+
+
+def test_the_benchmark_as_training_data(made, tmp_path):
+    cfg = compose(
+        "train", ["data=rooms-v1", f"data.root={tmp_path}", "data.make.num_train=7", "output_dir=x"]
+    )
+    data = build_data(cfg)
+    data.prepare_data()
+    assert made == [{"num_train": 7, "num_val": 100, "num_test": 100, "processes": 0, "progress": True}]

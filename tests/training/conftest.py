@@ -21,7 +21,7 @@ SMALL = [
 
 @pytest.fixture
 def batch(generator):
-    """One scene of two objects, seen by three cameras that look along +x."""
+    """One scene of two objects, seen by three cameras that look along +x; two more views to be rendered."""
     num_views, size = 3, (64, 64)
     poses = torch.eye(4).repeat(num_views, 1, 1)
     poses[:, :3, :3] = torch.tensor([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -48,6 +48,11 @@ def batch(generator):
         objects=(objects,),
         occupancy=torch.rand(1, 8, 8, 4, generator=generator) > 0.8,
         foreground=torch.rand(1, num_views, *size, generator=generator) > 0.5,
+        new_views=Views(
+            images=torch.randint(0, 256, (1, 2, 3, *size), dtype=torch.uint8, generator=generator),
+            intrinsics=intrinsics.repeat(1, 2, 1, 1),
+            world_from_camera=poses[None, :2] + 0.1 * torch.eye(4)[:, 3:].roll(1, 0) @ torch.eye(4)[3:],
+        ),
     )
 
 

@@ -11,7 +11,8 @@ import pytest
 import torch
 
 from raytran.errors import CheckpointError
-from raytran.training.checkpoint_file import FORMAT, read_checkpoint, read_newest, write_checkpoint
+from raytran.training.checkpoint_content import FORMAT
+from raytran.training.checkpoint_file import read_checkpoint, read_newest, write_checkpoint
 
 CARD = {"format": FORMAT, "stage": "joint", "preset": "tiny", "model": {}, "views": {}}
 

@@ -47,6 +47,23 @@ def test_terms_and_scores_are_logged_by_split_and_task(batch, make_module):
         assert 0 <= logged[name] <= 1, name
 
 
+def test_new_views_are_scored_beside_answers_that_render_nothing(batch, make_module):
+    logged = fit(make_module("novel_view"), batch, max_steps=1).logged_metrics
+    torch.testing.assert_close(logged["train/total"], 10 * logged["train/view"])
+    for name in ("psnr", "ssim", "psnr_best_constant", "psnr_nearest_frame"):
+        assert torch.isfinite(logged[f"val/view/{name}"]), name
+    assert "val/occupancy/iou" not in logged
+
+
+def test_training_renders_views_better(batch, make_module):
+    """Two photographs of noise: what can be learned of them is their mean colour."""
+    module = make_module("novel_view", "optimizer.learning_rate=0.01")
+    first = fit(module, batch, max_steps=1).logged_metrics
+    last = fit(module, batch, max_steps=20).logged_metrics
+    assert last["val/view"] < first["val/view"]
+    assert last["val/view/psnr"] > last["val/view/psnr_nearest_frame"] + 1
+
+
 def test_training_lowers_the_loss(batch, make_module):
     module = make_module("stage2")
     first = fit(module, batch, max_steps=1).logged_metrics["val/total"]

@@ -16,8 +16,8 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from raytran.backbone.backbone import Backbone
 from raytran.backbone.block import RayTracedBlock
+from raytran.backbone.lifting import LiftingBackbone
 from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
@@ -32,7 +32,7 @@ Trace = Callable[[Cameras], PairList | BlockPairs]
 
 @torch.no_grad()
 def run_in_chunks(
-    backbone: Backbone,
+    backbone: LiftingBackbone,
     images: Tensor,
     cameras: Cameras,
     grid: VoxelGrid,
@@ -41,7 +41,7 @@ def run_in_chunks(
     views_at_once: int,
     with_pixels: bool = True,
 ) -> tuple[Tensor, Tensor | None]:
-    """Return what ``Backbone.forward`` returns, ``views_at_once`` views of each scene at a time.
+    """Return what ``LiftingBackbone.forward`` returns, ``views_at_once`` views of each scene at a time.
 
     Args:
         backbone: in evaluation mode.
@@ -63,7 +63,7 @@ def run_in_chunks(
             "leave it out in training"
         )
     chunks = [slice(start, start + views_at_once) for start in range(0, images.shape[1], views_at_once)]
-    cameras_of = [_some(cameras, chunk) for chunk in chunks]
+    cameras_of = [cameras.select(chunk) for chunk in chunks]
     views = [images[:, chunk] for chunk in chunks]
     voxels, pixels = _start(backbone, views, cameras_of, grid, trace)
     for index, block in enumerate(backbone.blocks):
@@ -77,15 +77,15 @@ def run_in_chunks(
     return backbone.voxel_norm(voxels), torch.cat(normalized, dim=1)
 
 
-def _some(cameras: Cameras, chunk: slice) -> Cameras:
-    return Cameras(cameras.intrinsics[:, chunk], cameras.world_from_camera[:, chunk], cameras.image_size)
-
-
 def _start(
-    backbone: Backbone, images: Sequence[Tensor], cameras: Sequence[Cameras], grid: VoxelGrid, trace: Trace
+    backbone: LiftingBackbone,
+    images: Sequence[Tensor],
+    cameras: Sequence[Cameras],
+    grid: VoxelGrid,
+    trace: Trace,
 ) -> tuple[Tensor, list[Tensor]]:
     """Return what enters the first block: the voxels, and the pixels of each chunk."""
-    total = backbone.unseen.new_zeros(len(images[0]) * grid.num_voxels, backbone.channels)
+    total = backbone.projection.weight.new_zeros(len(images[0]) * grid.num_voxels, backbone.channels)
     count = total.new_zeros(len(total), dtype=torch.int64)
     pixels: list[Tensor] = []
     for chunk, some in zip(images, cameras, strict=True):

@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import cast
 from urllib.error import URLError
 
 import torch
 from torch import Tensor, nn
 
+from raytran.backbone.encoder_weights import load_state, read_state
 from raytran.errors import CheckpointError, ConfigError
 
 _log = logging.getLogger(__name__)
@@ -62,6 +62,9 @@ class ResNet18(nn.Module):
         ConfigError: weights are given for another width, or the stride is neither 16 nor 8.
         CheckpointError: the weights cannot be fetched, read, or do not fit.
     """
+
+    image_mean = (0.485, 0.456, 0.406)
+    image_std = (0.229, 0.224, 0.225)
 
     def __init__(
         self,
@@ -116,18 +119,12 @@ class ResNet18(nn.Module):
                 )
                 return
         else:
-            state = _read_state(Path(weights))
+            remedy = (
+                f"download {IMAGENET_URL} there, or set weights=imagenet, or weights=null for a random start"
+            )
+            state = read_state(Path(weights), name="ResNet-18", remedy=remedy)
         state = {key: value for key, value in state.items() if not key.startswith("fc.")}
-        first = state.get("conv1.weight")
-        if first is not None and first.shape[1] == 3 and self.input_channels == 4:
-            state["conv1.weight"] = torch.cat([first, torch.zeros_like(first[:, :1])], dim=1)
-        try:
-            self.load_state_dict(state)
-        except RuntimeError as error:
-            reason = str(error).splitlines()[-1].strip()
-            raise CheckpointError(
-                f"{weights} does not fit ResNet-18 ({reason}): give a state dict with torchvision's names"
-            ) from error
+        load_state(self, state, first="conv1.weight", source=weights, name="ResNet-18")
 
 
 def _stage(in_channels: int, channels: int, *, stride: int) -> nn.Sequential:
@@ -144,20 +141,3 @@ def _fetch_imagenet() -> dict[str, Tensor]:
             f"could not fetch the ImageNet weights ({error}): download {IMAGENET_URL} and put it at "
             f"{folder / name}, or set weights to its path, or weights=null for a random start"
         ) from error
-
-
-def _read_state(path: Path) -> dict[str, Tensor]:
-    if not path.is_file():
-        raise CheckpointError(
-            f"no ResNet-18 weights at {path}: download {IMAGENET_URL} there, "
-            "or set weights=imagenet, or weights=null for a random start"
-        )
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch.load raises whatever its unpickler or zip reader meets
-        raise CheckpointError(f"{path} is not a readable state dict ({error}): download it again") from error
-    if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
-        raise CheckpointError(
-            f"{path} holds no state dict: give a file of named tensors with torchvision's names"
-        )
-    return cast("dict[str, Tensor]", state)

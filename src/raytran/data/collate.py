@@ -29,18 +29,24 @@ def collate_scenes(samples: Sequence[SceneBatch]) -> SceneBatch:
         # Spares a copy of all images.
         return samples[0]
     objects = [sample.objects for sample in samples]
+    new_views = [sample.new_views for sample in samples]
     return SceneBatch(
         scene_id=tuple(chain.from_iterable(sample.scene_id for sample in samples)),
-        views=Views(
-            images=torch.cat([sample.views.images for sample in samples]),
-            intrinsics=torch.cat([sample.views.intrinsics for sample in samples]),
-            world_from_camera=torch.cat([sample.views.world_from_camera for sample in samples]),
-        ),
+        views=_join_views([sample.views for sample in samples]),
         frame_id=tuple(chain.from_iterable(sample.frame_id for sample in samples)),
         grid_center=torch.cat([sample.grid_center for sample in samples]),
         objects=None if None in objects else tuple(chain.from_iterable(o for o in objects if o is not None)),
         occupancy=_join([sample.occupancy for sample in samples]),
         foreground=_join([sample.foreground for sample in samples]),
+        new_views=None if None in new_views else _join_views([v for v in new_views if v is not None]),
+    )
+
+
+def _join_views(parts: Sequence[Views]) -> Views:
+    return Views(
+        images=torch.cat([views.images for views in parts]),
+        intrinsics=torch.cat([views.intrinsics for views in parts]),
+        world_from_camera=torch.cat([views.world_from_camera for views in parts]),
     )
 
 

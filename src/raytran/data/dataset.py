@@ -20,7 +20,7 @@ from raytran.data.scan2cad import SceneAnnotation, read_annotations, scene_objec
 from raytran.data.scannet import Scan, scan_views
 from raytran.data.scene_list import ObjectTable, RecentScans, annotated, choose_scenes, read_split
 from raytran.data.targets import foreground_masks, scene_occupancy, shape_grids
-from raytran.data.views import choose_even, choose_random
+from raytran.data.views import choose_even, choose_random, hold_out
 from raytran.errors import ConfigError, DataError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
@@ -32,7 +32,7 @@ TARGETS: tuple[str, ...] = ("objects", "shapes", "occupancy", "foreground")
 _MEMORY_OF_SCANS = 64 * 2**20
 """Bytes in which each process keeps cameras and file names: 300,000 frames, all of ScanNet at 200 a scan."""
 
-_DROPOUT, _AUGMENTATION = 1, 2
+_DROPOUT, _AUGMENTATION, _HELD_OUT = 1, 2, 3
 """What randomness is for, besides the choice of frames."""
 
 
@@ -53,6 +53,7 @@ class SceneDataset(Dataset[SceneBatch]):
         cache_dir: where targets are kept.
         image_size: ``(H, W)`` to which images are resized, whatever their aspect.
         num_views: N.
+        num_new_views: V, more frames of each scene, given apart as ``new_views``.
         view_choice: ``"random"`` or ``"even"``.
         grid_resolution: ``(X, Y, Z)`` of the occupancy target.
         grid_extent: sizes of its grid, metres; the grid is centred on the mean of the cameras.
@@ -77,6 +78,7 @@ class SceneDataset(Dataset[SceneBatch]):
         shapenet_root: Path | None = None,
         image_size: tuple[int, int] = (480, 640),
         num_views: int = 20,
+        num_new_views: int = 0,
         view_choice: Literal["random", "even"] = "random",
         grid_resolution: tuple[int, int, int] = (48, 48, 16),
         grid_extent: tuple[float, float, float] = (9.0, 9.0, 3.5),
@@ -95,7 +97,9 @@ class SceneDataset(Dataset[SceneBatch]):
         self._shapenet_root = None if shapenet_root is None else Path(shapenet_root)
         self._cache = MaskCache(folder=Path(cache_dir))
         self._image_size = (int(image_size[0]), int(image_size[1]))
-        self._num_views, self._min_views = num_views, min_views
+        # The frames to be rendered are chosen, read and changed along with the others.
+        self._num_views, self._num_new_views = num_views + num_new_views, num_new_views
+        self._min_views = min_views + num_new_views
         self._view_choice = view_choice
         self._grid_resolution, self._grid_extent = grid_resolution, grid_extent
         self._targets = frozenset(targets)
@@ -126,9 +130,12 @@ class SceneDataset(Dataset[SceneBatch]):
         views, used = scan_views(
             scan, self._choose(len(scan), index), image_size=self._image_size, min_views=self._min_views
         )
-        scene = self._scene(scan, views, used, self._with_shapes(self._objects_of[index]))
+        seen, rendered = self._hold_out(used, index)
+        scene = self._scene(scan, views, used, seen, self._with_shapes(self._objects_of[index]))
         if self._augmentation is not None:
             scene = self._augmentation(scene, self._generator(index, _AUGMENTATION))
+        if rendered:
+            scene = _divided(scene, seen, rendered)
         objects = () if scene.objects is None else scene.objects
         wanted = self._targets & {"objects", "shapes"}
         return replace(
@@ -138,7 +145,9 @@ class SceneDataset(Dataset[SceneBatch]):
             foreground=scene.foreground if "foreground" in self._targets else None,
         )
 
-    def _scene(self, scan: Scan, views: Views, used: Sequence[int], objects: ObjectSet) -> SceneBatch:
+    def _scene(
+        self, scan: Scan, views: Views, used: Sequence[int], seen: Sequence[int], objects: ObjectSet
+    ) -> SceneBatch:
         """Return a scene as it is on disk, with masks if they are wanted."""
         cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], self._image_size)
         foreground = self._foreground(objects, cameras)
@@ -149,7 +158,7 @@ class SceneDataset(Dataset[SceneBatch]):
             scene_id=(scan.scene_id,),
             views=views,
             frame_id=(tuple(scan.frame_id[i] for i in used),),
-            grid_center=cameras.position.mean(dim=0, keepdim=True),
+            grid_center=cameras.position[seen].mean(dim=0, keepdim=True),
             objects=(objects,),
             foreground=foreground,
         )
@@ -162,6 +171,13 @@ class SceneDataset(Dataset[SceneBatch]):
         if self._augmentation is None:
             return chosen
         return self._augmentation.drop_frames(chosen, self._min_views, self._generator(index, _DROPOUT))
+
+    def _hold_out(self, used: Sequence[int], index: int) -> tuple[list[int], list[int]]:
+        """Return the places of the frames to see and to render."""
+        if not self._num_new_views:
+            return list(range(len(used))), []
+        generator = None if self._view_choice == "even" else self._generator(index, _HELD_OUT)
+        return hold_out(used, self._num_new_views, generator)
 
     def _generator(self, index: int, *purpose: int) -> torch.Generator:
         """Return the source of randomness of scene ``index`` in this epoch, one for each purpose."""
@@ -248,6 +264,22 @@ def _check(
         raise ConfigError("targets and input masks need annotations: give the path of full_annotations.json")
     if (set(targets) - {"objects"} or mask) and shapenet_root is None:
         raise ConfigError("shapes, occupancy and masks need CAD models: give shapenet_root")
+
+
+def _divided(scene: SceneBatch, seen: Sequence[int], rendered: Sequence[int]) -> SceneBatch:
+    """Return the scene with some of its views, by their places, as the new ones."""
+    return replace(
+        scene,
+        views=_some(scene.views, seen),
+        new_views=_some(scene.views, rendered),
+        frame_id=tuple(tuple(names[place] for place in seen) for names in scene.frame_id),
+        foreground=None if scene.foreground is None else scene.foreground[:, list(seen)],
+    )
+
+
+def _some(views: Views, places: Sequence[int]) -> Views:
+    chosen = list(places)
+    return Views(views.images[:, chosen], views.intrinsics[:, chosen], views.world_from_camera[:, chosen])
 
 
 def _objects_in(annotations: Mapping[str, SceneAnnotation] | None, scene_id: str) -> ObjectSet:

@@ -22,6 +22,9 @@ _log = logging.getLogger(__name__)
 MIN_VIEWS = 2
 """Fewest different frames from which a scene is reconstructed."""
 
+MAX_SIDE = 8192
+"""Most pixels along a side of an image that is decoded: a few bytes can claim any number."""
+
 _UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
 """What Pillow raises for files that are truncated, damaged, absurdly large or no images."""
 
@@ -62,10 +65,11 @@ def decode_image(
         ``(3, H, W)`` uint8 RGB, a view of ``(H, W, 3)``.
 
     Raises:
-        DataError: the image is truncated, damaged, or of another size than ``stored``.
+        DataError: the image is truncated, damaged, larger than ``MAX_SIDE``, or not of size ``stored``.
     """
     try:
         with Image.open(BytesIO(image) if isinstance(image, bytes) else image) as opened:
+            _check_sides(opened.size, name)
             if stored is not None and opened.size != stored[::-1]:
                 raise DataError(
                     f"{name} is {opened.size[0]}x{opened.size[1]}, not {stored[1]}x{stored[0]} as the others"
@@ -197,15 +201,24 @@ def stored_size(paths: Sequence[Path]) -> tuple[int, int]:
     """Return ``(H, W)`` of the first image whose header can be read.
 
     Raises:
-        DataError: there is none.
+        DataError: there is none, or it is larger than ``MAX_SIDE``.
     """
     for path in paths:
         try:
             with Image.open(path) as image:
+                _check_sides(image.size, str(path))
                 return image.size[1], image.size[0]
         except _UNREADABLE:
             continue
     raise DataError(f"no image in {paths[0].parent} can be read: copy or export them again")
+
+
+def _check_sides(size: tuple[int, int], name: str) -> None:
+    if max(size) > MAX_SIDE:
+        raise DataError(
+            f"{name} claims {size[0]}x{size[1]} pixels, and at most {MAX_SIDE} a side are read: make the "
+            "images smaller, and scale the first row of the intrinsics by W'/W and the second by H'/H"
+        )
 
 
 @cache

@@ -94,7 +94,7 @@ def read_entries(path: Path) -> list[Any]:
         entries = json.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise DataError(f"cannot read the annotations {path} ({error.strerror}): check the path") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise DataError(f"{path} is not valid JSON ({error}): copy it again") from error
     if not isinstance(entries, list):
         raise DataError(f"{path} is not a list of scenes as Scan2CAD's full_annotations.json: check the path")
@@ -111,7 +111,7 @@ def parse_entry(entry: Any) -> SceneAnnotation:
         return _scene(entry)
     except KeyError as error:
         raise DataError(f"it has no field {error}") from error
-    except (TypeError, ValueError, RuntimeError) as error:
+    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise DataError(f"{type(error).__name__}: {error}") from error
 
 

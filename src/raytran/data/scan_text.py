@@ -15,6 +15,9 @@ from raytran.errors import DataError
 INFO_FILES = ("_info.txt", "info.txt")
 """Names of the C++ exporter's file of facts."""
 
+_MAX_BYTES = 1 << 20
+"""Of a file that are looked at; those of ScanNet have some hundred."""
+
 _OFF_CENTRE = 0.15
 """Largest distance of the principal point from the image centre, in widths or heights."""
 
@@ -22,7 +25,7 @@ _OFF_CENTRE = 0.15
 def read_matrix(path: Path) -> NDArray[np.float64] | None:
     """Return the matrix of 16 or 9 numbers in a text file as 4×4, or None if the file does not hold one."""
     try:
-        return _matrix(path.read_text(encoding="ascii"))
+        return _matrix(_start_of(path).decode("ascii"))
     except (OSError, ValueError):
         return None
 
@@ -39,7 +42,7 @@ def read_header(path: Path) -> dict[str, str]:
     """Return the ``key = value`` lines of a text file; none if there is no such file."""
     if not path.is_file():
         return {}
-    lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    lines = _start_of(path).decode("utf-8", errors="replace").splitlines()
     return {
         key.strip(): value.strip() for key, equals, value in (line.partition("=") for line in lines) if equals
     }
@@ -123,6 +126,11 @@ def check_intrinsics(
             "scale its first row by W'/W and its second by H'/H"
         )
     return torch.from_numpy(matrix[:3, :3].copy())
+
+
+def _start_of(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(_MAX_BYTES)
 
 
 def _matrix(text: str) -> NDArray[np.float64]:

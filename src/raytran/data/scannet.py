@@ -165,12 +165,17 @@ def even_views(
     Raises:
         DataError: fewer than two images can be read.
     """
+    report_dropped(scan)
+    views, used = scan_views(scan, choose_even(len(scan), num_views).tolist(), image_size=image_size)
+    return views, tuple(scan.frame_id[i] for i in used)
+
+
+def report_dropped(scan: OpenScan) -> None:
+    """Log how many frames of a scan have no image or pose."""
     if scan.dropped:
         total = len(scan) + len(scan.dropped)
         reasons = ", ".join(sorted(set(scan.dropped.values())))
         _log.info("%s: dropped %d of %d frames (%s)", scan.scene_id, len(scan.dropped), total, reasons)
-    views, used = scan_views(scan, choose_even(len(scan), num_views).tolist(), image_size=image_size)
-    return views, tuple(scan.frame_id[i] for i in used)
 
 
 def scan_views(

@@ -15,7 +15,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from raytran.data.images import decode_image, resize
+from raytran.data.images import MAX_SIDE, decode_image, resize
 from raytran.errors import DataError
 
 _log = logging.getLogger(__name__)
@@ -27,7 +27,6 @@ _FRAME_HEADER = struct.Struct("<64s4Q")
 _CALIBRATION = struct.Struct("<64f2i4IfQ")
 
 _MAX_NAME = 4096
-_MAX_SIDE = 8192
 _MAX_FRAMES = 1_000_000
 """Ten hours of video; an index of so many frames takes 88 MB."""
 _MAX_BYTES_PER_PIXEL = 8
@@ -230,7 +229,7 @@ class SensFile:
                 "download it again"
             )
         if not (
-            0 < width <= _MAX_SIDE and 0 < height <= _MAX_SIDE and max(depth_width, depth_height) <= _MAX_SIDE
+            0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE and max(depth_width, depth_height) <= MAX_SIDE
         ):
             raise DataError(
                 f"{self.path} claims frames of {width}x{height} and depth of {depth_width}x{depth_height}: "

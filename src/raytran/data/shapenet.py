@@ -89,6 +89,11 @@ def has_model(root: Path, catid: str, model_id: str) -> bool:
     return _find_mesh(root, catid, model_id) is not None
 
 
+def categories(root: Path) -> list[str]:
+    """Return the ShapeNet categories of which there may be models, of either release, sorted."""
+    return sorted({folder.name for nest in _NESTS for folder in (root / nest).glob(f"{_CATEGORY}/")})
+
+
 def model_names(root: Path, catid: str) -> list[str]:
     """Return the names of all models of a category whose mesh file is there, of either release, sorted."""
     folders = {folder.name for nest in _NESTS for folder in (root / nest / catid).glob("*/")}

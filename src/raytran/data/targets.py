@@ -114,15 +114,24 @@ def foreground_masks(
     ]
     masks, missing = cache.read_stack("foreground", keys, cameras.image_size)
     if missing:
-        meshes = [
-            _place(_unit_mesh(shapenet_root, model_id, content), objects, m)
-            for m, (model_id, content) in enumerate(zip(objects.model_id, contents, strict=True))
-        ]
+        meshes = object_meshes(objects, shapenet_root=shapenet_root)
         chosen = Cameras(cameras.intrinsics[missing], cameras.world_from_camera[missing], cameras.image_size)
         masks[missing] = rasterize_mask(meshes, chosen).numpy()
         for i in missing:
             cache.write("foreground", keys[i], masks[i])
     return torch.from_numpy(masks)
+
+
+def object_meshes(objects: ObjectSet, *, shapenet_root: Path) -> list[tuple[NDArray, NDArray]]:
+    """Return vertices ``(V, 3)`` in the world and faces ``(F, 3)`` of the CAD model of each of M objects.
+
+    Raises:
+        DataError: a CAD file is missing or cannot be read.
+    """
+    return [
+        _place(_unit_mesh(shapenet_root, model_id, _content(shapenet_root, model_id)), objects, m)
+        for m, model_id in enumerate(objects.model_id)
+    ]
 
 
 def _content(shapenet_root: Path, model_id: str) -> str:

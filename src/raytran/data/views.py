@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -37,3 +39,27 @@ def choose_even(n: int, count: int) -> Tensor:
         ``(count,)`` int64, ascending.
     """
     return (2 * torch.arange(count) + 1) * n // (2 * count)
+
+
+def hold_out(
+    used: Sequence[int], count: int, generator: torch.Generator | None
+) -> tuple[list[int], list[int]]:
+    """Divide frames into those to see and those to render; none is both.
+
+    Args:
+        used: N + count frames of a scene, some of which may come more than once.
+        count: how many to hold out, fewer than there are different frames.
+        generator: source of the randomness; None holds out frames spread evenly.
+
+    Returns:
+        the places in ``used`` of the N frames to see, and of those held out. If one of the latter comes more
+        than once, some of the former do.
+    """
+    frames = sorted(set(used))
+    chosen = (
+        choose_even(len(frames), count) if generator is None else choose_random(len(frames), count, generator)
+    )
+    rendered = [frames[i] for i in chosen.tolist()]
+    seen = [place for place, frame in enumerate(used) if frame not in rendered]
+    seen = [seen[i] for i in choose_even(len(seen), len(used) - count).tolist()]
+    return seen, [used.index(frame) for frame in rendered]

@@ -18,6 +18,9 @@ from raytran.types import CadAlignments
 
 _log = logging.getLogger(__name__)
 
+ALIGNMENTS = "scan2cad.csv"
+"""Name of the file of one scene in the folder of its results."""
+
 SCAN2CAD_COLUMNS: tuple[str, ...] = (
     *("catid_cad", "id_cad", "tx", "ty", "tz", "qw", "qx", "qy", "qz", "sx", "sy", "sz"),
 )

@@ -23,7 +23,9 @@ def write_scene_json(path: Path, prediction: ScenePrediction, mesh_names: Sequen
     """Write a prediction's objects, in their order.
 
     ``center`` and ``rotation`` are in the world of the input poses (+Z up, metres); ``size`` and ``rotation``
-    follow the object frame (x width, y height, z depth; +Y up, front -Z); ``yaw`` is in radians.
+    follow the object frame (x width, y height, z depth; +Y up, front -Z); ``yaw`` is in radians. Where views
+    were counted, ``num_views`` says how many saw the object's box and ``confidence`` is the score times
+    ``n / (n + 1)`` of that number: what few saw is less certain than its score.
 
     Args:
         path: the file; written whole or not at all.
@@ -46,6 +48,9 @@ def write_scene_json(path: Path, prediction: ScenePrediction, mesh_names: Sequen
             "yaw": float(yaw[i]),
             "mesh": mesh,
         }
+        if objects.num_views is not None:
+            views = float(objects.num_views[i])
+            entry |= {"num_views": round(views, 1), "confidence": entry["score"] * views / (views + 1)}
         if objects.model_id and objects.model_id[i]:
             entry["catid_cad"], entry["id_cad"] = objects.model_id[i].split("/", 1)
         entries.append(entry)
@@ -70,7 +75,7 @@ def read_scene_json(path: Path) -> ScenePrediction:
         content = json.loads(Path(path).read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise DataError(f"no scene file at {path}; write one with `python -m raytran.predict`") from error
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"cannot read {path} as JSON ({error}); write it again") from error
     found = content.get("format") if isinstance(content, dict) else None
     if found != FORMAT:
@@ -81,7 +86,7 @@ def read_scene_json(path: Path) -> ScenePrediction:
             objects=_objects(content["objects"]),
             grid_center=torch.full((3,), torch.nan),
         )
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
         raise DataError(
             f"an object in {path} is incomplete or malformed ({error!r}); write it again"
         ) from error

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from raytran.errors import ShapeError, check_shape
+from raytran.types import Views
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,15 @@ class Cameras:
                 "expected as many intrinsics as poses, got "
                 f"{tuple(self.intrinsics.shape[:-2])} and {tuple(self.world_from_camera.shape[:-2])}"
             )
+
+    @staticmethod
+    def of(views: Views) -> Cameras:
+        """Return the cameras that took the views, of leading shape ``(B, N)``."""
+        return Cameras(views.intrinsics, views.world_from_camera, views.image_size)
+
+    def select(self, views: slice) -> Cameras:
+        """Return some of the N cameras of each scene, both of leading shape ``(B, N)``."""
+        return Cameras(self.intrinsics[:, views], self.world_from_camera[:, views], self.image_size)
 
     @property
     def position(self) -> Tensor:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sinusoidal code of positions in the volume."""
+"""What a network is told of places in the volume: sines of positions, numbers of rays."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+
+from raytran.geometry.camera import Cameras
+from raytran.geometry.grid import VoxelGrid
 
 LOWEST, HIGHEST = 0.5, 16.0
 """Waves that fit into the volume, of the lowest and of the highest frequency. Vaswani et al. (2017) span a
@@ -31,3 +34,20 @@ def position_code(points: Tensor, extent: Sequence[float], channels: int) -> Ten
     angle = (2 * math.pi * points / points.new_tensor(list(extent)))[..., None] * cycles
     code = torch.cat([angle.sin(), angle.cos()], dim=-1).flatten(-2)
     return torch.nn.functional.pad(code, (0, channels - 6 * count))
+
+
+def ray_code(cameras: Cameras, grid: VoxelGrid, feature_size: Sequence[int]) -> Tensor:
+    """Return origin, from the grid's centre in metres, and unit direction of the centre rays of cells.
+
+    Args:
+        cameras: of leading shape ``(B, N)``.
+        grid: the voxel grids, ``center`` ``(B, 3)``.
+        feature_size: ``(h, w)``.
+
+    Returns:
+        ``(B · N, h, w, 6)``.
+    """
+    origin, direction = cameras.cell_rays((feature_size[0], feature_size[1]))
+    origin = origin[..., 0, :] - grid.center[:, None, None, None]
+    direction = torch.nn.functional.normalize(direction[..., 0, :], dim=-1)
+    return torch.cat([origin.expand_as(direction), direction], dim=-1).flatten(0, 1)

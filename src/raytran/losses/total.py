@@ -17,10 +17,11 @@ from raytran.losses.objects import object_losses
 from raytran.losses.occupancy import occupancy_loss
 from raytran.losses.proposals import proposal_losses
 from raytran.losses.shape import shape_loss
+from raytran.losses.view import view_loss
 from raytran.types import ObjectSet, RawObjects, RawScene, SceneBatch
 
-WEIGHTS = ("occupancy", "foreground", "class", "center", "size", "yaw", "heat", "shape")
-TERMS = ("occupancy", "foreground", "objects", "shape")
+WEIGHTS = ("occupancy", "foreground", "class", "center", "size", "yaw", "heat", "shape", "view")
+TERMS = ("occupancy", "foreground", "objects", "shape", "view")
 
 _T = TypeVar("_T")
 _U = TypeVar("_U")
@@ -71,9 +72,9 @@ class TotalLoss(nn.Module):
                 scenes; None where there is one rank.
 
         Returns:
-            ``occupancy``, ``foreground``, ``shape``; ``objects/class``, ``objects/center``, ``objects/size``,
-            ``objects/yaw`` of the last decoder layer, ``objects/class/layer0`` and so on of earlier ones,
-            ``objects/heat/proposals`` and so on of the proposals, if the network makes any.
+            ``occupancy``, ``foreground``, ``shape``, ``view``; ``objects/class``, ``objects/center``,
+            ``objects/size``, ``objects/yaw`` of the last decoder layer, ``objects/class/layer0`` and so on of
+            earlier ones, ``objects/heat/proposals`` and so on of the proposals, if the network makes any.
 
         Raises:
             ConfigError: a term is unknown, or the network was not asked for it.
@@ -91,6 +92,8 @@ class TotalLoss(nn.Module):
                 losses["occupancy"] = occupancy_loss(*_both("occupancy", raw.occupancy, batch.occupancy))
             if "foreground" in terms:
                 losses["foreground"] = foreground_loss(*_both("foreground", raw.foreground, batch.foreground))
+            if "view" in terms:
+                losses["view"] = view_loss(*_both("view", raw.new_views, batch.new_views))
             if "objects" in terms or "shape" in terms:
                 losses |= self._objects(raw, batch, terms, decode_shapes, mean_over_ranks)
             weighted = [self._weight(name) * value for name, value in losses.items()]
@@ -195,7 +198,6 @@ def _both(name: str, predicted: _T | None, target: _U | None) -> tuple[_T, _U]:
     if predicted is None:
         raise ConfigError(f"the loss term {name} needs the task {name}: ask the network for it")
     if target is None:
-        raise DataError(
-            f"the loss term {name} needs its targets in the batch: add {name} to the data set's targets"
-        )
+        remedy = "hold frames out" if name == "view" else f"add {name} to the data set's targets"
+        raise DataError(f"the loss term {name} needs its targets in the batch: {remedy}")
     return predicted, target

@@ -4,6 +4,7 @@
 from raytran.metrics.atlas import ErrorAtlas
 from raytran.metrics.curves import AccuracyCurves
 from raytran.metrics.image import PSNR, SSIM
+from raytran.metrics.new_views import NewViewScores
 from raytran.metrics.odam import OrientedBoxF1
 from raytran.metrics.scan2cad import Scan2CADAccuracy
 from raytran.metrics.scene import ForegroundIoU, SceneOccupancyIoU
@@ -16,6 +17,7 @@ __all__ = [
     "ErrorAtlas",
     "ForegroundIoU",
     "MatchedShapeScores",
+    "NewViewScores",
     "OrientedBoxF1",
     "Scan2CADAccuracy",
     "SceneOccupancyIoU",

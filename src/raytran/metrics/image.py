@@ -66,7 +66,7 @@ class PSNR(_FrameMean):
 
     def values(self, predicted: Tensor, target: Tensor) -> Tensor:
         """Return the PSNR of each frame; infinite where the images are equal."""
-        return peak_signal_noise_ratio(predicted, target, data_range=1.0, dim=(1, 2, 3), reduction="none")
+        return psnr_of_frames(predicted, target)
 
 
 class SSIM(_FrameMean):
@@ -80,5 +80,15 @@ class SSIM(_FrameMean):
 
     def values(self, predicted: Tensor, target: Tensor) -> Tensor:
         """Return the SSIM of each frame, at most 1."""
-        similarity = structural_similarity_index_measure(predicted, target, data_range=1.0, reduction="none")
-        return cast("Tensor", similarity).reshape(len(predicted))  # torchmetrics drops the dimension of one
+        return ssim_of_frames(predicted, target)
+
+
+def psnr_of_frames(predicted: Tensor, target: Tensor) -> Tensor:
+    """Return the PSNR in decibels of each frame, float32 ``(N, 3, H, W)`` twice → ``(N,)``."""
+    return peak_signal_noise_ratio(predicted, target, data_range=1.0, dim=(1, 2, 3), reduction="none")
+
+
+def ssim_of_frames(predicted: Tensor, target: Tensor) -> Tensor:
+    """Return the SSIM of each frame, float32 ``(N, 3, H, W)`` twice → ``(N,)``."""
+    similarity = structural_similarity_index_measure(predicted, target, data_range=1.0, reduction="none")
+    return cast("Tensor", similarity).reshape(len(predicted))  # torchmetrics drops the dimension of one

@@ -4,18 +4,21 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
+
+import torch
 
 from raytran.errors import CheckpointError
-from raytran.training.checkpoint_file import FORMAT, read_checkpoint
+from raytran.run.weights import checkpoint_path
+from raytran.training.checkpoint_content import FORMAT
+from raytran.training.checkpoint_file import read_checkpoint
+from raytran.training.weights_file import PREFIX
 
 if TYPE_CHECKING:
     from raytran.model import RayTran
-
-_PREFIX = "model."
 
 
 def checkpoint_card(
@@ -45,13 +48,17 @@ def checkpoint_card(
     }
 
 
-def load_model(path: str | Path) -> RayTran:
+def load_model(checkpoint: str | Path) -> RayTran:
     """Return the model of a checkpoint, in evaluation mode, on the CPU.
+
+    Args:
+        checkpoint: path of the file, or ``default`` for the weights that the package carries.
 
     Raises:
         CheckpointError: the file is missing, damaged, or its weights do not fit the model described in it.
     """
-    return model_from(read_checkpoint(Path(path)), Path(path))
+    path = checkpoint_path(checkpoint)
+    return model_from(read_checkpoint(path), path)
 
 
 @dataclass(frozen=True)
@@ -71,13 +78,17 @@ class PredictionSettings:
     num_views: int
 
 
-def prediction_settings(path: str | Path) -> PredictionSettings:
+def prediction_settings(checkpoint: str | Path) -> PredictionSettings:
     """Read how a checkpoint is to be used.
+
+    Args:
+        checkpoint: path of the file, or ``default`` for the weights that the package carries.
 
     Raises:
         CheckpointError: the file is missing or damaged.
     """
-    card = read_checkpoint(Path(path))
+    path = checkpoint_path(checkpoint)
+    card = read_checkpoint(path)
     views = card["views"]
     try:
         height, width = map(int, views["image_size"])
@@ -96,26 +107,45 @@ def model_from(checkpoint: Mapping[str, Any], path: Path) -> RayTran:
     from raytran.model import RayTran
     from raytran.run.checkpoint_config import build_network
 
-    model = build_network(checkpoint["model"], path)
-    if not isinstance(model, RayTran):
+    with torch.device("meta"):  # the file's size, and not what it claims, decides how much memory is taken
+        shell = build_network(checkpoint["model"], path)
+    if not isinstance(shell, RayTran):
         raise CheckpointError(f"{path} describes only a part of a network: do not use this file")
+    load_weights(shell, checkpoint, path, assign=True)
+    model = cast("RayTran", build_network(checkpoint["model"], path))
     load_weights(model, checkpoint, path)
     return model.eval()
 
 
-def load_weights(model: RayTran, checkpoint: Mapping[str, Any], path: Path) -> None:
+def load_weights(
+    model: RayTran,
+    checkpoint: Mapping[str, Any],
+    path: Path,
+    *,
+    assign: bool = False,
+    begins: Sequence[str] = (),
+) -> None:
     """Fill ``model`` with the weights of a checkpoint.
+
+    Args:
+        model: the network.
+        checkpoint: what ``read_checkpoint`` returned.
+        path: where from, for messages.
+        assign: take the checkpoint's tensors themselves, instead of copying into those of ``model``.
+        begins: parts that keep the weights they have if the checkpoint has none of theirs.
 
     Raises:
         CheckpointError: names or shapes differ.
     """
     state = {
-        name.removeprefix(_PREFIX): value
+        name.removeprefix(PREFIX): value
         for name, value in checkpoint["state_dict"].items()
-        if name.startswith(_PREFIX)
+        if name.startswith(PREFIX)
     }
+    fresh = [f"{part}." for part in begins if not any(name.startswith(f"{part}.") for name in state)]
+    state |= {name: value for name, value in model.state_dict().items() if name.startswith(tuple(fresh))}
     try:
-        model.load_state_dict(state)
+        model.load_state_dict(state, assign=assign)
     except RuntimeError as error:
         reason = str(error).splitlines()[-1].strip()
         raise CheckpointError(

@@ -78,6 +78,8 @@ def count_part(
         # Each ray is cut by the planes of three axes; a pair is written as two integers.
         planes = sum(model.grid_resolution) * model.rays_per_cell**2 * pairs.num_pixels
         return Work(10.0 * planes, 16.0 * len(pairs))
+    if part.over_pairs == "projection":
+        return Work(0.0, 16.0 * len(pairs))
     if part.over_pairs == "splat":
         return Work(len(pairs) * channels, rows) * (2 if training else 1)
     # Forward: query, key, value, result; two products. Backward: query, key, value, result, its gradient, the

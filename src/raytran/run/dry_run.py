@@ -22,9 +22,10 @@ from torch.autograd.function import once_differentiable
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-import raytran.backbone.backbone
 import raytran.backbone.block
 import raytran.backbone.chunked
+import raytran.backbone.lifting
+import raytran.ops.center_tracer
 import raytran.ops.ray_tracer
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
@@ -104,6 +105,9 @@ def stand_ins(pairs_per_pixel: float, *, fused: bool) -> Iterator[None]:
         index = torch.empty(2, round(pairs_per_pixel * pixels), dtype=torch.int64)
         return PairList(index[0], index[1], pixels, scenes * grid.num_voxels)
 
+    def pair_centers(cameras: Cameras, grid: VoxelGrid, feature_size: tuple[int, int]) -> PairList:
+        return trace_pairs(cameras, grid, feature_size)
+
     def ray_attention(query: Tensor, key: Tensor, value: Tensor, pairs: PairList, *_: Any, **__: Any) -> Any:
         kept = query.shape[0] if fused else len(pairs)
         return _Attention.apply(query, key, value, kept, fused)
@@ -117,8 +121,9 @@ def stand_ins(pairs_per_pixel: float, *, fused: bool) -> Iterator[None]:
 
     replaced = {
         raytran.ops.ray_tracer: (trace_pairs,),
+        raytran.ops.center_tracer: (pair_centers,),
         raytran.backbone.block: (ray_attention,),
-        raytran.backbone.backbone: (splat_features,),
+        raytran.backbone.lifting: (splat_features,),
         raytran.backbone.chunked: (ray_attention, splat_features, ray_attention_with_sum),
     }
     real = [(module, f.__name__, getattr(module, f.__name__)) for module, fs in replaced.items() for f in fs]

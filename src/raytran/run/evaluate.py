@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, cast
 
@@ -20,14 +19,14 @@ from torch.utils.data import Dataset, Subset
 
 from raytran.errors import ConfigError
 from raytran.metrics.curves import accuracy_by_scene_size
-from raytran.metrics.records import Row
 from raytran.model import RayTran
 from raytran.run.build import build_data
 from raytran.run.checkpoint import PredictionSettings, load_model, prediction_settings
 from raytran.run.device import choose_device
 from raytran.run.entry import compose
+from raytran.run.evaluate_views import FILES, evaluate_views, views_table
 from raytran.run.output import check_replaceable, replaced_folder
-from raytran.run.score import score
+from raytran.run.score import score, write_csv
 from raytran.training.scores import DUPLICATE_IOU, SCORE_THRESHOLD, SceneScores
 from raytran.types import SceneBatch
 
@@ -66,22 +65,29 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     _make_data_fit(cfg, settings, model, tasks)
     data = build_data(cfg)
     data.prepare_data()
+    scenes, title = with_at_most(cfg.max_objects, data.split(cfg.split)), f"{cfg.split} scenes of {data.root}"
+    about = {
+        "checkpoint": str(cfg.checkpoint),
+        "data": str(data.root),
+        "split": cfg.split,
+        "max_objects": cfg.max_objects,
+    }
+    if settings.stage == "view":
+        metrics = evaluate_views(model, scenes, output=output, views_at_once=cfg.views_at_once, about=about)
+        Console().print(views_table(metrics, title=f"{settings.preset}, {title}"))
+        _log.info("wrote %s: %s", output.resolve(), ", ".join(FILES))
+        return metrics
     metrics = evaluate_model(
         model,
-        with_at_most(cfg.max_objects, data.split(cfg.split)),
+        scenes,
         tasks=tasks,
         output=output,
         score_threshold=cfg.score_threshold,
         duplicate_iou=cfg.duplicate_iou,
         views_at_once=cfg.views_at_once,
-        about={
-            "checkpoint": str(cfg.checkpoint),
-            "data": str(data.root),
-            "split": cfg.split,
-            "max_objects": cfg.max_objects,
-        },
+        about=about,
     )
-    Console().print(metrics_table(metrics, title=f"{settings.preset}, {cfg.split} scenes of {data.root}"))
+    Console().print(metrics_table(metrics, title=f"{settings.preset}, {title}"))
     _log.info("wrote %s: metrics.json, per_scene.csv, per_object.csv", output.resolve())
     return metrics
 
@@ -94,6 +100,10 @@ def _make_data_fit(
     cfg.views.num_views = cfg.num_views or settings.num_views
     if "shape" in tasks:
         cfg.stage.targets = [*cfg.stage.targets, "shapes"]
+    if settings.stage == "view":
+        cfg.stage.targets = []
+    else:
+        cfg.stage.new_views = 0
     cfg.model.grid_resolution, cfg.model.grid_extent = list(model.grid_resolution), list(model.grid_extent)
     # One that was trained with the true masks as a fourth channel gets them here.
     cfg.data.dataset.input_mask = model.backbone.resnet.input_channels == 4
@@ -165,8 +175,8 @@ def evaluate_model(
     if output is not None:
         with replaced_folder(output, marker=MARKER) as folder:
             (folder / MARKER).write_text(json.dumps(metrics, indent=2) + "\n")
-            _write_csv(folder / "per_scene.csv", scores.rows("scene"))
-            _write_csv(folder / "per_object.csv", scores.rows("object"))
+            write_csv(folder / "per_scene.csv", scores.rows("scene"))
+            write_csv(folder / "per_object.csv", scores.rows("object"))
     return metrics
 
 
@@ -221,10 +231,3 @@ def metrics_table(metrics: Mapping[str, Any], *, title: str) -> Table:
         if shape["chamfer_distance"] is not None:
             table.add_row("chamfer distance of these", "", "", f"{100 * shape['chamfer_distance']:.1f} cm")
     return table
-
-
-def _write_csv(path: Path, rows: Sequence[Row]) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=list(rows[0]) if rows else ["scene_id"])
-        writer.writeheader()
-        writer.writerows(rows)

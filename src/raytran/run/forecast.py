@@ -54,7 +54,8 @@ class Load:
 
     def fake_pairs(self, model: RayTran) -> PairList:
         """Return pairs without data; to be called in a ``FakeTensorMode``."""
-        pixels = self.scenes * self.views * self.image_size[0] * self.image_size[1] // 256
+        pixels = self.scenes * self.views * self.image_size[0] * self.image_size[1]
+        pixels //= model.backbone.stride**2
         index = torch.empty(round(pixels * self.pairs_per_pixel), dtype=torch.int64)
         x, y, z = model.grid_resolution
         return PairList(index, index, pixels, self.scenes * x * y * z)

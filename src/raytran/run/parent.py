@@ -12,6 +12,7 @@ from typing import Any
 from raytran.errors import CheckpointError, ConfigError
 from raytran.run.folders import newest_finished
 from raytran.run.settings import RunConfig
+from raytran.run.weights import checkpoint_path
 from raytran.training.stage import Stage
 
 _log = logging.getLogger(__name__)
@@ -56,9 +57,10 @@ def find_parent(run: RunConfig, stage: Stage) -> Path | None:
 
     Raises:
         ConfigError: ``init_from=auto`` finds no finished run of the parent stage.
+        CheckpointError: ``init_from=default``, and the package was built without weights.
     """
     if run.init_from not in ("auto", "none"):
-        return Path(run.init_from)
+        return checkpoint_path(run.init_from)
     if run.init_from == "none" or stage.parent is None:
         return None
     found = newest_finished(
@@ -75,7 +77,7 @@ def find_parent(run: RunConfig, stage: Stage) -> Path | None:
 
 
 def check_parent(parent: Parent, stage: Stage, check: str) -> None:
-    """Raise unless ``parent`` is of the stage that ``stage`` builds on, or of its own, and knows its task.
+    """Raise unless ``parent`` is of a stage that ``stage`` builds on, or of its own, and knows its task.
 
     Args:
         parent: the checkpoint to start from.
@@ -85,7 +87,7 @@ def check_parent(parent: Parent, stage: Stage, check: str) -> None:
     Raises:
         CheckpointError: the parent is of another stage or its validation score is too low.
     """
-    if stage.parent is None or parent.stage == stage.name:
+    if stage.parent is None or parent.stage in (stage.name, *stage.other_parents):
         return
     again = f"train experiment={stage.parent_experiment}"
     if parent.stage != stage.parent:

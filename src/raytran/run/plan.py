@@ -163,7 +163,8 @@ def _pairs_per_pixel(cfg: DictConfig, model: RayTran, load: Load) -> float:
     grid = VoxelGrid(model.grid_resolution, model.grid_extent, cameras.position.mean(dim=0))
     stride = model.backbone.stride
     size = (load.image_size[0] // stride, load.image_size[1] // stride)
-    pairs = trace_pairs(cameras.scaled_to(load.image_size), grid, size, model.rays_per_cell)
+    tracer = model.backbone.tracer or trace_pairs
+    pairs = tracer(cameras.scaled_to(load.image_size), grid, size, model.rays_per_cell)
     return len(pairs) / pairs.num_pixels
 
 
@@ -189,10 +190,13 @@ def _training(model: RayTran, load: Load, stage: Stage, precision: str, ceilings
         work.seconds(*_both(ceilings)) / 3 for name, work in parts.items() if "→" in name
     )  # a third of a block's work is its forward pass
     needs = []
-    for repeat in dict.fromkeys((model.backbone.checkpoint_blocks, True)):
-        model.backbone.checkpoint_blocks = repeat
+    backbone = model.backbone
+    for repeat in dict.fromkeys((backbone.checkpoint_blocks, bool(backbone.blocks))):
+        backbone.checkpoint_blocks = repeat
         used = _peak(training_bytes(model, load, stage, precision=precision))
         setting = f"model.backbone.checkpoint_blocks={str(repeat).lower()}"
+        if not backbone.blocks:
+            setting = "everything kept"
         needs.append(Need("train", setting, load.views, used, seconds + (again if repeat else 0.0)))
     return needs
 

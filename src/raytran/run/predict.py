@@ -4,20 +4,23 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from pathlib import Path
+from typing import Unpack
 
 from omegaconf import DictConfig
 
 from raytran.data.importers.open import open_scene
 from raytran.data.importers.orient import WorldSettings
-from raytran.data.scannet import even_views
+from raytran.data.shapenet import shapenet_version
+from raytran.errors import ConfigError
 from raytran.model import RayTran
-from raytran.postprocess import object_meshes, select_objects
-from raytran.run.checkpoint import load_model, prediction_settings
+from raytran.postprocess import object_meshes
+from raytran.run.checkpoint import PredictionSettings, load_model, prediction_settings
 from raytran.run.device import choose_device
 from raytran.run.output import check_replaceable
+from raytran.run.render_views import cameras_to_render, render_views
 from raytran.run.scene_files import MARKER, PredictedScene, write_scene
+from raytran.run.volumes import Limits, RoomViews, check_choice, predict_room, predict_volume, read_room
 from raytran.types import Views
 
 _LOG = logging.getLogger(__name__)
@@ -25,8 +28,12 @@ _LOG = logging.getLogger(__name__)
 _UNTRAINED = {
     "occupancy": "its objects mean nothing yet; predict with a checkpoint of stage shape",
     "joint": "its meshes mean nothing yet; predict with a checkpoint of stage shape",
+    "view": "it renders new views; its objects mean nothing unless stage.trainable left the backbone alone",
 }
 """Stage of the curriculum that is not the last → what to expect of its checkpoints."""
+
+RGB = 3
+"""Channels of the images that a scene without annotation has."""
 
 
 def predict(cfg: DictConfig) -> Path:
@@ -42,65 +49,78 @@ def predict(cfg: DictConfig) -> Path:
     """
     scene, output = Path(cfg.scene).resolve(), Path(cfg.output)
     world = WorldSettings(up=cfg.up, scale=cfg.scale, convention=cfg.convention, check=cfg.check)
+    check_choice(cfg.frames, cfg.num_views)
     check_replaceable(output.resolve(), marker=MARKER)
+    if cfg.cads:
+        shapenet_version(Path(cfg.cads))  # It raises where there are none, before the network runs.
     settings = prediction_settings(cfg.checkpoint)
     if settings.stage in _UNTRAINED:
         _LOG.warning("%s is of stage %s: %s", cfg.checkpoint, settings.stage, _UNTRAINED[settings.stage])
-    num_views = cfg.num_views or settings.num_views
-    with open_scene(scene, format=cfg.format, settings=world) as scan:
-        views, frame_ids = _without_repeats(
-            *even_views(scan, image_size=settings.image_size, num_views=num_views)
-        )
     model = load_model(cfg.checkpoint).to(choose_device(cfg.device))
-    found = predict_scene(
+    _check_channels(model, cfg.checkpoint)
+    new_cameras = cameras_to_render(cfg.views, model, cfg.checkpoint)
+    room = _read(cfg, world, settings, model)
+    prediction = predict_room(
         model,
-        views,
+        room,
         scene_id=scene.stem if scene.is_file() else scene.name,
         score_threshold=cfg.score_threshold,
         duplicate_iou=cfg.duplicate_iou,
         views_at_once=cfg.views_at_once,
     )
-    write_scene(output, found, views, frame_ids, grid_extent=model.grid_extent, num_overlays=cfg.num_overlays)
+    found = PredictedScene(prediction, object_meshes(prediction))
+    if cfg.cads:
+        found = found.with_cads(Path(cfg.cads))
+    write_scene(
+        output,
+        found,
+        room.views,
+        room.frame_ids,
+        grid_extent=room.volumes.joint().extent,
+        num_overlays=cfg.num_overlays,
+        turntable=cfg.turntable,
+    )
+    if new_cameras is not None:
+        render_views(model, room, new_cameras, output, views_at_once=cfg.views_at_once)
     _report(output, found)
     return output
 
 
-def predict_scene(
-    model: RayTran,
-    views: Views,
-    *,
-    scene_id: str,
-    score_threshold: float,
-    duplicate_iou: float | None,
-    views_at_once: int | None = None,
-) -> PredictedScene:
-    """Run the network on the views of one scene and make meshes of the objects it found.
+def predict_scene(model: RayTran, views: Views, **limits: Unpack[Limits]) -> PredictedScene:
+    """Run the network on the views of one scene, in one volume, and make meshes of the objects it found.
 
     Args:
         model: the network, on any device.
         views: B = 1.
-        scene_id: name to give the result.
-        score_threshold: objects with a lower score are left out.
-        duplicate_iou: of two objects of a class with a higher box IoU, the weaker is left out; None: neither.
-        views_at_once: views that pass through the network together, None for all; fewer need less memory.
+        limits: see ``predict_volume``.
 
     Returns:
         The result, on the CPU.
     """
-    device = next(model.parameters()).device
-    raw = model.predict(
-        views.to(device), scene_id=scene_id, score_threshold=score_threshold, views_at_once=views_at_once
-    )
-    prediction = select_objects(raw.to("cpu"), score_threshold=score_threshold, duplicate_iou=duplicate_iou)
+    prediction = predict_volume(model, views, **limits)
     return PredictedScene(prediction, object_meshes(prediction))
 
 
-def _without_repeats(views: Views, frame_ids: Sequence[str]) -> tuple[Views, tuple[str, ...]]:
-    """Leave out second appearances of frames, which come when more are asked for than there are."""
-    first = {name: n for n, name in reversed(list(enumerate(frame_ids)))}
-    kept = sorted(first.values())
-    views = Views(views.images[:, kept], views.intrinsics[:, kept], views.world_from_camera[:, kept])
-    return views, tuple(frame_ids[n] for n in kept)
+def _read(cfg: DictConfig, world: WorldSettings, settings: PredictionSettings, model: RayTran) -> RoomViews:
+    """Return the frames that the network is given, and its volumes."""
+    with open_scene(Path(cfg.scene).resolve(), format=cfg.format, settings=world) as scan:
+        return read_room(
+            scan,
+            frames=cfg.frames,
+            num_views=cfg.num_views or settings.num_views,
+            image_size=settings.image_size,
+            resolution=model.grid_resolution,
+            extent=model.grid_extent,
+        )
+
+
+def _check_channels(model: RayTran, checkpoint: str) -> None:
+    """Raise if the network wants masks beside the images."""
+    if model.backbone.resnet.input_channels != RGB:
+        raise ConfigError(
+            f"{checkpoint} was trained with the true masks as a fourth channel, which only annotated scenes "
+            "have: use it with python -m raytran.evaluate, or give a checkpoint that was trained without"
+        )
 
 
 def _report(output: Path, found: PredictedScene) -> None:
@@ -112,4 +132,4 @@ def _report(output: Path, found: PredictedScene) -> None:
             "%s: no object has a score above the threshold; lower score_threshold to see weaker ones",
             found.prediction.scene_id,
         )
-    _LOG.info("wrote %s: scene.json, scene.glb, meshes/, topdown.png, overlays/", output.resolve())
+    _LOG.info("wrote %s: %s", output.resolve(), ", ".join(sorted(path.name for path in output.iterdir())))

@@ -12,24 +12,20 @@ from omegaconf import DictConfig
 
 from raytran.data.cads.furniture import import_furniture
 from raytran.data.prepare import PrepareSettings, Released, prepare_scan2cad
+from raytran.data.rooms.benchmark import generate_rooms_v1, generate_rooms_v1_furniture
 from raytran.data.rooms.generate import generate_rooms
 from raytran.errors import ConfigError
 from raytran.run.build import plain
 from raytran.run.check import check
+from raytran.run.rooms_report import report_on_rooms
 
 _log = logging.getLogger(__name__)
 
-_ROOMS = (
-    "num_train",
-    "num_val",
-    "seed",
-    "frames",
-    "image_size",
-    "min_objects",
-    "max_objects",
-    "room_size",
-    "processes",
-)
+_COUNTS = ("num_train", "num_val", "num_test")
+_CHOSEN = ("seed", "frames", "image_size", "min_objects", "max_objects", "room_size")
+"""What can be chosen of free rooms only."""
+
+_FIXED = "rooms-v1 is the same for everybody; dataset=rooms makes rooms of your choice"
 
 
 def prepare(cfg: DictConfig) -> Any:
@@ -52,16 +48,60 @@ def prepare(cfg: DictConfig) -> Any:
 
 
 def _rooms(settings: dict[str, Any], output: Path) -> Any:
-    chosen = {name: settings[name] for name in _ROOMS}
-    report = generate_rooms(output, cads=_path(settings["cads"]), **chosen)
+    _refuse(settings, "num_test", because="dataset=rooms has no test rooms, dataset=rooms-v1 has")
+    settings = _with_the_presets(settings)
+    report = generate_rooms(
+        output,
+        cads=_path(settings["cads"]),
+        processes=settings["processes"],
+        **{name: settings[name] for name in ("num_train", "num_val", *_CHOSEN)},
+    )
     _log.info("rooms are in %s; train on them with data.root=%s", output.resolve(), output)
     return report
+
+
+def _rooms_v1(settings: dict[str, Any], output: Path) -> Any:
+    _refuse(settings, *_CHOSEN, because=_FIXED)
+    _refuse(settings, "cads", because="given CAD models go with dataset=rooms-v1-furniture")
+    report = generate_rooms_v1(output, processes=settings["processes"], **_given(settings, *_COUNTS))
+    _log.info("%s\nthe rooms are in %s", report_on_rooms(report.root), report.root)
+    _log.info("train on them with data=rooms-v1 data.root=%s, then evaluate … split=test", output)
+    return report
+
+
+def _rooms_v1_furniture(settings: dict[str, Any], output: Path) -> Any:
+    _refuse(settings, *_CHOSEN, because=_FIXED)
+    _refuse(settings, "num_train", "num_val", because="rooms-v1-furniture has test rooms only")
+    if settings["cads"] is None:
+        raise ConfigError("cads= is missing: give the folder that prepare dataset=cads wrote")
+    numbers = _given(settings, "num_test")
+    report = generate_rooms_v1_furniture(
+        output, cads=Path(settings["cads"]), processes=settings["processes"], **numbers
+    )
+    _log.info("%s\nthe rooms are in %s; evaluate on them with", report_on_rooms(report.root), report.root)
+    _log.info("python -m raytran.evaluate checkpoint=CKPT data=scan2cad data.root=%s split=test", output)
+    return report
+
+
+def _refuse(settings: dict[str, Any], *names: str, because: str) -> None:
+    given = _given(settings, *names)
+    if given:
+        raise ConfigError(f"leave out {', '.join(f'{name}=' for name in given)}: {because}")
+
+
+def _given(settings: dict[str, Any], *names: str) -> dict[str, Any]:
+    return {name: settings[name] for name in names if settings[name] is not None}
+
+
+def _with_the_presets(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings with those of the preset's rooms where none was given."""
+    return settings | {name: value for name, value in settings["rooms"].items() if settings[name] is None}
 
 
 def _scan2cad(settings: dict[str, Any], output: Path) -> Any:
     if settings["scannet"] is None:
         raise ConfigError("scannet= is missing: give the folder of ScanNet's scans")
-    height, width = settings["image_size"]
+    height, width = _with_the_presets(settings)["image_size"]
     released = Released(
         scannet=Path(settings["scannet"]),
         shapenet=_path(settings["shapenet"]),
@@ -95,6 +135,8 @@ def _path(value: str | None) -> Path | None:
 
 _DATASETS: dict[str, Callable[[dict[str, Any], Path], Any]] = {
     "rooms": _rooms,
+    "rooms-v1": _rooms_v1,
+    "rooms-v1-furniture": _rooms_v1_furniture,
     "scan2cad": _scan2cad,
     "cads": _cads,
 }

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from raytran.errors import CheckpointError, ConfigError
 from raytran.losses.matcher import HungarianMatcher
 from raytran.losses.total import TotalLoss
-from raytran.model import RayTran
+from raytran.model import RayTran, inputs_of
 from raytran.parcel import Parcel
 from raytran.run.checkpoint import model_from
 from raytran.run.device import choose_device
@@ -85,7 +85,7 @@ def run_step(
         for batch in batches:
             device = batch.grid_center.device.type
             with torch.autocast(device, dtype=autocast, enabled=autocast is not None):
-                raw = model(batch.views, tasks=stage.tasks, grid_center=batch.grid_center)
+                raw = model(**inputs_of(batch), tasks=stage.tasks)
                 losses = loss(raw, batch, terms=stage.terms, decode_shapes=model.decode_shapes)
             (losses["total"] / len(batches)).backward()
             for name, value in losses.items():

@@ -5,14 +5,17 @@ from __future__ import annotations
 
 import json
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from raytran.data.rooms.benchmark import generate_rooms_v1
 from raytran.data.rooms.generate import generate_rooms
 
 _log = logging.getLogger(__name__)
 
 LISTS = ("scannetv2_train.txt", "scannetv2_val.txt")
+LISTS_V1 = (*LISTS, "scannetv2_test.txt")
 
 
 def ensure_rooms(output: Path, **settings: Any) -> None:
@@ -39,11 +42,49 @@ def ensure_rooms(output: Path, **settings: Any) -> None:
     generate_rooms(output, **settings)
 
 
-def rooms_are_complete(output: Path) -> bool:
+def ensure_rooms_v1(
+    output: Path, *, num_train: int, num_val: int, num_test: int, processes: int = 0, progress: bool = True
+) -> None:
+    """Make rooms-v1 in ``output`` unless at least as many rooms are there, which are then used as they are.
+
+    Args:
+        output: the data set.
+        num_train: training rooms.
+        num_val: validation rooms.
+        num_test: test rooms.
+        processes: worker processes, 0 for one per core.
+        progress: show a progress bar.
+
+    Raises:
+        DataError: other rooms are there.
+        ConfigError: a number is too large.
+    """
+    output = Path(output)
+    asked = (num_train, num_val, num_test)
+    if rooms_are_complete(output, LISTS_V1):
+        there = [len(_scans(output, name)) for name in LISTS_V1]
+        if all(found >= count for found, count in zip(there, asked, strict=True)):
+            return
+    count = sum(asked)
+    _log.info("making %d rooms in %s (first use; an interrupted set is completed)", count, output.resolve())
+    generate_rooms_v1(
+        output,
+        num_train=num_train,
+        num_val=num_val,
+        num_test=num_test,
+        processes=processes,
+        progress=progress,
+    )
+
+
+def rooms_are_complete(output: Path, lists: Sequence[str] = LISTS) -> bool:
     """Say whether ``output`` holds a whole set of rooms: the lists, written last, and every scan in them."""
-    scannet = output / "scannet"
-    lists = [scannet / name for name in LISTS]
-    if not (output / "rooms.json").is_file() or not all(path.is_file() for path in lists):
+    if not all((output / name).is_file() for name in ("rooms.json", *(f"scannet/{name}" for name in lists))):
         return False
-    scans = [scan for path in lists for scan in path.read_text(encoding="utf-8").split()]
-    return all((scannet / "scans" / scan).is_dir() for scan in scans)
+    return all(
+        (output / "scannet" / "scans" / scan).is_dir() for name in lists for scan in _scans(output, name)
+    )
+
+
+def _scans(output: Path, name: str) -> list[str]:
+    return (output / "scannet" / name).read_text(encoding="utf-8").split()

@@ -4,17 +4,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import trimesh
 
 from raytran.export import write_prediction
+from raytran.export.glb import write_glb
+from raytran.export.nearest_cad import NearestCads, nearest_cads
+from raytran.export.scan2cad_csv import ALIGNMENTS, write_alignments_csv
 from raytran.geometry.camera import Cameras
 from raytran.run.output import replaced_folder
 from raytran.types import ObjectSet, ScenePrediction, Views
 from raytran.view.overlay import draw_overlays
 from raytran.view.topdown import draw_topdown
+from raytran.view.turntable import draw_turntable
 
 MARKER = "scene.json"
 """The file that tells a finished result."""
@@ -22,10 +26,26 @@ MARKER = "scene.json"
 
 @dataclass(frozen=True)
 class PredictedScene:
-    """A prediction whose best objects were chosen, and their meshes in the world (None: empty shape)."""
+    """A prediction whose best objects were chosen, and what was made of it.
+
+    Attributes:
+        prediction: its ``M`` objects.
+        meshes: of each object, in the world; None: empty shape.
+        cads: the CAD model of each object; None: not asked for.
+    """
 
     prediction: ScenePrediction
     meshes: Sequence[trimesh.Trimesh | None]
+    cads: NearestCads | None = None
+
+    def with_cads(self, root: Path) -> PredictedScene:
+        """Return the scene with the CAD models of a library that its objects are most like.
+
+        Raises:
+            DataError: ``root`` holds no CAD model.
+        """
+        cads = nearest_cads(self.prediction.objects, root)
+        return replace(self, prediction=replace(self.prediction, objects=cads.objects), cads=cads)
 
 
 def write_scene(
@@ -36,9 +56,10 @@ def write_scene(
     *,
     grid_extent: tuple[float, float, float],
     num_overlays: int = 4,
+    turntable: int = 24,
     truth: ObjectSet | None = None,
 ) -> None:
-    """Write ``scene.json``, ``scene.glb``, ``meshes/``, ``topdown.png`` and ``overlays/``, all or nothing.
+    """Write what ``docs/outputs.md`` lists, all or nothing.
 
     Args:
         output: folder; replaced if it is an earlier result.
@@ -47,6 +68,7 @@ def write_scene(
         frame_ids: name of each frame.
         grid_extent: sizes of the voxel grid, metres.
         num_overlays: frames to draw over.
+        turntable: pictures of the turn in ``turntable.gif``; 0: there is none.
         truth: annotated objects to draw in the plan, or None.
 
     Raises:
@@ -58,5 +80,18 @@ def write_scene(
         draw_topdown(
             folder / "topdown.png", prediction, truth=truth, cameras=cameras, grid_extent=grid_extent
         )
+        if turntable:
+            draw_turntable(
+                folder / "turntable.gif",
+                prediction.objects,
+                found.meshes,
+                cameras=cameras,
+                num_frames=turntable,
+            )
         draw_overlays(folder / "overlays", views, frame_ids, prediction, found.meshes, count=num_overlays)
-        write_prediction(folder, prediction, found.meshes)
+        if found.cads is not None:
+            write_alignments_csv(folder / ALIGNMENTS, found.cads.alignments())
+            write_glb(folder / "cads.glb", prediction.objects, found.cads.meshes())
+        write_prediction(
+            folder, prediction, found.meshes, cameras=cameras, frame_ids=frame_ids, grid_extent=grid_extent
+        )

@@ -145,7 +145,7 @@ def _write(output: Path, metrics: Mapping[str, Any], scores: Mapping[str, Protoc
     with replaced_folder(output, marker=MARKER) as folder:
         (folder / MARKER).write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
         for name, rows in tables.items():
-            _write_csv(folder / name, rows)
+            write_csv(folder / name, rows)
         if "strict" in scores:
             misses = [row for row in scores["strict"].objects if row["cause"] != "found"]
             content = {**metrics["strict"]["atlas"], "misses": misses}
@@ -156,9 +156,9 @@ def _written(metrics: Mapping[str, Any]) -> list[str]:
     return [MARKER, "per_object.csv", "per_scene.csv", *(["atlas.json"] if "strict" in metrics else [])]
 
 
-def _write_csv(path: Path, rows: Sequence[Row]) -> None:
+def write_csv(path: Path, rows: Sequence[Row]) -> None:
     """Write rows whose columns differ by protocol: a cell that a row lacks stays empty."""
-    columns = list(dict.fromkeys(column for row in rows for column in row)) or ["protocol", "scene_id"]
+    columns = list(dict.fromkeys(column for row in rows for column in row)) or ["scene_id"]
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=columns, restval="")
         writer.writeheader()

@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from raytran.errors import DataError
-from raytran.export.scan2cad_csv import read_alignments_csv, read_roca_csv
+from raytran.export.alignments import align_cads
+from raytran.export.scan2cad_csv import ALIGNMENTS, read_alignments_csv, read_roca_csv
 from raytran.export.scene_json import read_scene_json
-from raytran.geometry.rotation import matrix_from_quaternion, quaternion_from_matrix
+from raytran.geometry.rotation import matrix_from_quaternion
 from raytran.types import CLASS_BY_CATID, CLASSES, CadAlignments, ObjectSet
 
 _log = logging.getLogger(__name__)
@@ -118,6 +119,8 @@ def _files_by_scene(folder: Path) -> dict[str, Path]:
         path = entry / "scene.json" if entry.is_dir() else entry
         if entry.name.startswith(".") or path.suffix not in (".json", ".csv") or not path.is_file():
             continue
+        if entry.name == ALIGNMENTS:  # raytran.predict writes it beside a scene.json of the same objects
+            continue
         name = entry.name if entry.is_dir() else entry.stem
         if entry.name == "scene.json":  # the folder is one that raytran.predict has written for one scene
             name = read_scene_json(entry).scene_id
@@ -186,21 +189,13 @@ def _from_objects(path: Path, objects: ObjectSet, cad_boxes: CadBoxes) -> SceneP
     names = objects.model_id or ("",) * len(objects)
     known = [name in cad_boxes and bool((cad_boxes[name][1] > 0).all()) for name in names]
     center, half = _lookup([name if ok else "" for name, ok in zip(names, known, strict=True)], cad_boxes)
-    scale = objects.size / (2 * half)
     catid_of = {category: catid for catid, category in CLASS_BY_CATID.items()}
     parts = [name.partition("/") for name in names]
-    boxes = CadAlignments(
-        catid=tuple(
-            part[0] or catid_of.get(CLASSES[label], "")
-            for part, label in zip(parts, objects.label.tolist(), strict=True)
-        ),
-        id_cad=tuple(part[2] for part in parts),
-        translation=objects.center - (objects.rotation @ (scale * center)[..., None])[..., 0],
-        quaternion=quaternion_from_matrix(objects.rotation),
-        scale=scale,
-        score=objects.score,
-        half_extent=half,
-    )
+    catids = [
+        part[0] or catid_of.get(CLASSES[label], "")
+        for part, label in zip(parts, objects.label.tolist(), strict=True)
+    ]
+    boxes = align_cads(objects, catids, [part[2] for part in parts], center=center, half_extent=half)
     complete = all(names)
     index = torch.tensor(known, dtype=torch.bool).nonzero().squeeze(1)
     cads = replace(boxes.select(index), half_extent=None) if complete else None

@@ -33,8 +33,8 @@ class Part:
         name: what it is.
         times: how often a step runs it.
         run: its forward pass; None if there is nothing to take gradients of.
-        over_pairs: ``attention`` or ``splat`` for what runs along the pairs, ``traversal`` for what makes
-            them; None for dense work.
+        over_pairs: ``attention`` or ``splat`` for what runs along the pairs, ``traversal`` (of rays) or
+            ``projection`` (of voxel centres) for what makes them; None for dense work.
     """
 
     name: str
@@ -57,31 +57,36 @@ def step_parts(
         tasks: heads that run.
     """
     backbone = model.backbone
-    cameras = Cameras(views.intrinsics, views.world_from_camera, views.image_size)
+    cameras = Cameras.of(views)
     grid = VoxelGrid(model.grid_resolution, model.grid_extent, cameras.position.mean(dim=1))
     scenes, count = views.images.shape[:2]
     height, width = (side // backbone.stride for side in views.image_size)
-    block = cast("RayTracedBlock", backbone.blocks[0])
     with_pixels = "foreground" in tasks
 
     def features(*shape: int) -> Tensor:
-        like = backbone.unseen
+        like = backbone.projection.weight
         return torch.randn(*shape, dtype=like.dtype, device=like.device, requires_grad=model.training)
 
     voxels = features(scenes, *grid.resolution, backbone.channels)
     pixels = features(scenes * count, height, width, backbone.channels)
 
     def trace() -> None:
-        model.ray_tracer(cameras, grid, (height, width), model.rays_per_cell)
+        tracer = backbone.tracer or model.ray_tracer
+        tracer(cameras, grid, (height, width), model.rays_per_cell)
 
-    blocks, to_pixels = len(backbone.blocks), len(backbone.blocks) - (not with_pixels)
     parts = [
         Part("encoder", 1, lambda: backbone.embed(views.images, cameras, grid)),
-        Part("traversal", 1, trace, "traversal"),
+        Part("traversal", 1, trace, "projection" if backbone.tracer else "traversal"),
         Part("splat", 1, lambda: splat_features(pixels.flatten(0, 2), pairs)[0], "splat"),
-        *_stream_parts("pixels → voxels", blocks, block.voxel_stream, voxels, pixels, pairs),
-        *_stream_parts("voxels → pixels", to_pixels, block.pixel_stream, pixels, voxels, pairs),
     ]
+    if backbone.blocks:
+        block, blocks = cast("RayTracedBlock", backbone.blocks[0]), len(backbone.blocks)
+        to_pixels = blocks - (not with_pixels)
+        parts += _stream_parts("pixels → voxels", blocks, block.voxel_stream, voxels, pixels, pairs)
+        parts += _stream_parts("voxels → pixels", to_pixels, block.pixel_stream, pixels, voxels, pairs)
+    else:
+        start, seen = features(scenes * grid.num_voxels, backbone.channels), torch.ones(0)
+        parts.append(Part("3D convolutions", 1, lambda: backbone.start_voxels(start, seen, grid)))
     heads = {
         "occupancy": lambda: model.heads["occupancy"](voxels),
         "foreground": lambda: model.heads["foreground"](pixels.unflatten(0, (scenes, count))),

@@ -127,6 +127,10 @@ def _start(cfg: DictConfig, run: RunConfig) -> tuple[Reconstruction, Path | None
     found = _to_continue(run)
     if found is not None:
         path, content = found
+        if "resume" not in content:
+            raise CheckpointError(
+                f"{path} holds weights but no state of training: start a new run with init_from={path}"
+            )
         module = build_module(cfg, build_model(cfg, pretrained=False))
         if content["stage"] != module.stage.name:
             raise CheckpointError(
@@ -146,7 +150,7 @@ def _start(cfg: DictConfig, run: RunConfig) -> tuple[Reconstruction, Path | None
     parent = Parent.of(start, content)
     check_parent(parent, stage, run.check_parent)
     module = build_module(cfg, build_model(cfg, pretrained=False))
-    load_weights(module.model, content, start)
+    load_weights(module.model, content, start, begins=module.stage.begins)
     return module, None, parent.as_plain()
 
 

@@ -12,21 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from raytran.errors import CheckpointError
+from raytran.training.checkpoint_content import DamagedCheckpointError, check_content
+from raytran.training.weights_file import is_weights_file, read_weights
 
 _log = logging.getLogger(__name__)
 
-FORMAT = "raytran.checkpoint/1"
 LAST_NAME = "last.ckpt"
 PREVIOUS_NAME = "previous.ckpt"
-
-_REQUIRED = {"stage": str, "preset": str, "model": dict, "views": dict, "state_dict": dict}
-
-
-class DamagedCheckpointError(CheckpointError):
-    """A checkpoint that was whole once."""
 
 
 def write_checkpoint(path: Path, content: dict[str, Any]) -> None:
@@ -83,13 +77,20 @@ def _replace(partial: Path, path: Path) -> None:
 def read_checkpoint(path: Path) -> dict[str, Any]:
     """Return the content of a checkpoint, on the CPU. Nothing inside is run, whoever wrote the file.
 
+    It may be one that training wrote, or weights that were exported to a ``.safetensors`` file.
+
     Raises:
         DamagedCheckpointError: the file is cut short or some of its bytes have changed.
         CheckpointError: the file is missing, no checkpoint of raytran, of a newer format, or holds more than
             tensors and plain values.
     """
     if not path.is_file():
-        raise CheckpointError(f"no checkpoint at {path}: give the path of a .ckpt file that training wrote")
+        raise CheckpointError(
+            f"no checkpoint at {path}: give the path of a .ckpt file that training wrote, "
+            "or of a .safetensors file that was exported from one"
+        )
+    if is_weights_file(path):
+        return read_weights(path)
     _check_bytes(path)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
@@ -100,7 +101,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
         ) from error
     except Exception as error:  # a made-up file can fail anywhere in the reader
         raise _damaged(path) from error
-    _check_content(content, path)
+    check_content(content, path)
     return content
 
 
@@ -146,25 +147,3 @@ def _damaged(path: Path) -> DamagedCheckpointError:
         f"cannot read {path}: the file is damaged or cut short; take another copy of it, "
         "or delete it and train that stage again"
     )
-
-
-def _check_content(content: Any, path: Path) -> None:
-    """Raise unless ``content`` is what this version of raytran writes."""
-    found = content.get("format") if isinstance(content, dict) else None
-    family, _, version = FORMAT.partition("/")
-    if isinstance(found, str) and found.startswith(f"{family}/") and found != FORMAT:
-        newer = found.removeprefix(f"{family}/")
-        if newer.isdigit() and int(newer) > int(version):
-            raise CheckpointError(
-                f"{path} was written by a newer raytran (format {found}, this one reads {FORMAT}): "
-                "update raytran"
-            )
-    if found != FORMAT:
-        raise CheckpointError(f"{path} is no checkpoint of raytran: expected format {FORMAT}, got {found}")
-    for name, kind in _REQUIRED.items():
-        if not isinstance(content.get(name), kind):
-            raise CheckpointError(f"{path} is no whole checkpoint of raytran: it has no proper '{name}'")
-    if not all(
-        isinstance(name, str) and isinstance(value, Tensor) for name, value in content["state_dict"].items()
-    ):
-        raise CheckpointError(f"{path} is no checkpoint of raytran: some of its weights are no tensors")

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchmetrics import MeanMetric
 
 from raytran.losses.total import TotalLoss
-from raytran.model import RayTran
+from raytran.model import RayTran, inputs_of
 from raytran.training.health_signals import StepOutcome
 from raytran.training.optim import Optimization
 from raytran.training.ranks import mean_over_ranks
@@ -95,7 +95,7 @@ class Reconstruction(pl.LightningModule):
 
     def _run_model(self, batch: SceneBatch) -> RawScene:
         run = self._compiled or self.model
-        return run(batch.views, tasks=self.stage.tasks, grid_center=batch.grid_center)
+        return run(**inputs_of(batch), tasks=self.stage.tasks)
 
     def _losses(self, raw: RawScene, batch: SceneBatch, **options: Any) -> dict[str, Tensor]:
         return self.loss(

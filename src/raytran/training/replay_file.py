@@ -80,6 +80,7 @@ def _batch(plain: Mapping[str, Any]) -> SceneBatch:
             "scene_id": tuple(plain["scene_id"]),
             "frame_id": tuple(tuple(names) for names in plain["frame_id"]),
             "views": Views(**plain["views"]),
+            "new_views": None if plain.get("new_views") is None else Views(**plain["new_views"]),
             "objects": None
             if objects is None
             else tuple(ObjectSet(**{**one, "model_id": tuple(one["model_id"])}) for one in objects),

@@ -7,11 +7,13 @@ from collections.abc import Collection, Sequence
 from functools import partial
 from typing import Any, Literal
 
+import torch
 from torch import nn
 from torchmetrics import Metric
 
 from raytran.metrics.atlas import ErrorAtlas
 from raytran.metrics.curves import AccuracyCurves
+from raytran.metrics.new_views import NewViewScores
 from raytran.metrics.odam import OrientedBoxF1
 from raytran.metrics.records import Row
 from raytran.metrics.scan2cad import Scan2CADAccuracy
@@ -28,10 +30,10 @@ _OF_ALL_SCORES = ("best", "average_precision", "mean_average_precision")
 
 
 class SceneScores(nn.Module):
-    """Alignment accuracy, box F1 and shapes of objects, IoU of occupancy and masks, over all scenes seen.
+    """Alignment accuracy, box F1 and shapes of objects, IoU of occupancy and masks, PSNR of new views.
 
     Args:
-        tasks: what the model predicts: some of ``objects``, ``occupancy``, ``foreground``, ``shape``.
+        tasks: what the model predicts: ``objects``, ``occupancy``, ``foreground``, ``shape``, ``view``.
         score_threshold: objects with a lower score do not count as predicted.
         duplicate_iou: nor does one that overlaps a surer one of its class by more than this IoU.
         volume_extent: size of the voxel grid, metres; given, the results also tell why objects are missed
@@ -59,6 +61,7 @@ class SceneScores(nn.Module):
         self.shape = MatchedShapeScores() if "shape" in tasks else None
         self.occupancy = SceneOccupancyIoU() if "occupancy" in tasks else None
         self.foreground = ForegroundIoU() if "foreground" in tasks else None
+        self.view = NewViewScores() if "view" in tasks else None
 
     def update(self, batch: SceneBatch, predictions: Sequence[ScenePrediction]) -> None:
         """Add scenes; a metric whose targets the batch lacks is left as it is."""
@@ -78,6 +81,9 @@ class SceneScores(nn.Module):
                 and prediction.foreground is not None
             ):
                 self.foreground.update(prediction.foreground[None], batch.foreground[index, None], names)
+        rendered = [p.new_views for p in predictions if p.new_views is not None]
+        if self.view is not None and batch.new_views is not None and len(rendered) == len(predictions):
+            self.view.update(torch.stack(rendered), batch.new_views, batch.views, batch.scene_id)
 
     def _update_objects(
         self, batch: SceneBatch, targets: Sequence[ObjectSet], predictions: Sequence[ScenePrediction]
@@ -133,6 +139,8 @@ class SceneScores(nn.Module):
         for task in ("occupancy", "foreground"):
             if task in found:
                 numbers[f"{task}/iou"] = found[task]
+        for name in (name for name in found.get("view", {}) if name != "n_views"):
+            numbers[f"view/{name}"] = found["view"][name]
         return numbers
 
     def rows(self, per: Literal["scene", "object"]) -> list[Row]:

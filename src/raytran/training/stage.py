@@ -19,6 +19,7 @@ class Stage:
     Attributes:
         name: ``occupancy``, ``joint``, ``shape``, …
         parent: name of the stage whose weights this one starts from, None for the first.
+        other_parents: names of more stages that may be the parent, if one is given by hand.
         parent_experiment: the experiment that trains the parent, to be named in messages.
         parent_score: validation score by which the parent has learned its task, e.g. ``occupancy/iou``.
         parent_minimum: what that score must exceed for this stage to start.
@@ -27,6 +28,8 @@ class Stage:
         targets: what the data set must provide.
         trainable: names of the model's parts that train, e.g. ``heads.shape``; all others are frozen and in
             evaluation mode, so that batch-norm statistics stay as they are.
+        begins: names of the parts that start at random where the parent has none.
+        new_views: frames of each scene that are held out to be rendered.
     """
 
     name: str
@@ -38,6 +41,9 @@ class Stage:
     terms: Sequence[str]
     targets: Sequence[str]
     trainable: Sequence[str]
+    other_parents: Sequence[str] = ()
+    begins: Sequence[str] = ()
+    new_views: int = 0
 
     def freeze(self, model: RayTran) -> None:
         """Let gradients reach the parameters of ``model`` that train in this stage and no others.

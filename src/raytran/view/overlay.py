@@ -116,19 +116,24 @@ def _fill_meshes(
     edge[:, 1:] |= ids[:, 1:] != ids[:, :-1]
     edge[1:] |= ids[1:] != ids[:-1]
     share = torch.where(edge, 0.9, _FILL)[covered][:, None]
-    light = torch.where(edge, 1.0, _headlight(depth, camera))[covered][:, None]
+    directions = camera.cell_rays(camera.image_size)[1][..., 0, :]
+    light = torch.where(edge, 1.0, headlight(depth, directions))[covered][:, None]
     result = torch.from_numpy(image.astype(np.float32))
     result[covered] = (1 - share) * result[covered] + share * light * colors[ids[covered]]
     return result.round().to(torch.uint8).numpy()
 
 
-def _headlight(depth: Tensor, camera: Cameras) -> Tensor:
-    """Return light by how squarely surfaces face the camera, ``(H, W)`` in [0.55, 1.1], from depths alone."""
-    _, directions = camera.cell_rays(camera.image_size)
-    points = directions[..., 0, :] * depth.nan_to_num(posinf=0.0)[..., None].to(directions)
+def headlight(depth: Tensor, directions: Tensor) -> Tensor:
+    """Return light by how squarely surfaces face the camera, ``(H, W)`` in [0.55, 1.1], from depths alone.
+
+    Args:
+        depth: ``(H, W)`` along the camera's z axis, metres; infinite where there is no surface.
+        directions: ``(H, W, 3)`` of the pixels' rays, of unit depth, in any frame.
+    """
+    points = directions * depth.nan_to_num(posinf=0.0)[..., None].to(directions)
     right, down = torch.gradient(points, dim=(1, 0))
     normal = torch.nn.functional.normalize(torch.linalg.cross(right, down), dim=-1)
-    sight = torch.nn.functional.normalize(directions[..., 0, :], dim=-1)
+    sight = torch.nn.functional.normalize(directions, dim=-1)
     return (0.55 + 0.55 * (normal * sight).sum(dim=-1).abs()).float()
 
 

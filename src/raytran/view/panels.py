@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,25 @@ def draw_masks(
             tile[edge] = _OUTLINE
         tiles.append(Image.fromarray(tile))
     return contact_sheet(path, tiles, columns)
+
+
+def draw_new_views(path: Path, seen: Views, truth: Views, rendered: Tensor, *, count: int = 4) -> Path:
+    """Write some frames that were seen above photographs of new views above what was rendered, as JPEG.
+
+    Args:
+        path: the file.
+        seen: one scene of ``N`` frames.
+        truth: ``V`` photographs of the scene.
+        rendered: ``(V, 3, H, W)`` in [0, 1].
+        count: how many in a row.
+    """
+    pictured = replace(truth, images=rendered[None])
+    tiles = []
+    for views in (seen, truth, pictured):
+        number = views.images.shape[1]
+        shown = choose_even(number, min(count, len(rendered)))
+        tiles += [frame_image(views, n) for n in shown.tolist()]
+    return contact_sheet(path, tiles, columns=min(count, len(rendered)))
 
 
 def draw_occupancy(

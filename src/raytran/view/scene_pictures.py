@@ -10,7 +10,7 @@ from raytran.geometry.camera import Cameras
 from raytran.postprocess import object_meshes
 from raytran.types import SceneBatch, ScenePrediction
 from raytran.view.overlay import draw_objects, frame_image
-from raytran.view.panels import contact_sheet, draw_masks, draw_occupancy
+from raytran.view.panels import contact_sheet, draw_masks, draw_new_views, draw_occupancy
 from raytran.view.topdown import draw_topdown
 
 _FRAMES = 4
@@ -35,8 +35,8 @@ def draw_scene(
         grid_extent: sizes of the voxel grid, metres.
 
     Returns:
-        Name of each picture → its file: ``masks``, ``occupancy``, and with true objects in the batch
-        ``topdown`` and ``boxes``.
+        Name of each picture → its file: ``masks``, ``occupancy``, ``new_views``, and with true objects in the
+        batch ``topdown`` and ``boxes``.
     """
     folder.mkdir(parents=True, exist_ok=True)
     pictures: dict[str, Path] = {}
@@ -48,6 +48,11 @@ def draw_scene(
         truth = None if batch.occupancy is None else batch.occupancy[0]
         path = folder / "occupancy.png"
         pictures["occupancy"] = draw_occupancy(path, prediction.occupancy, truth, height=grid_extent[2])
+    if prediction.new_views is not None and batch.new_views is not None:
+        path = folder / "new_views.jpg"
+        pictures["new_views"] = draw_new_views(
+            path, batch.views, batch.new_views, prediction.new_views, count=_FRAMES
+        )
     if batch.objects is not None:
         views = batch.views
         cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], views.image_size)

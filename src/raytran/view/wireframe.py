@@ -24,6 +24,11 @@ def box_corners(objects: ObjectSet) -> Tensor:
     return OrientedBoxes(objects.center, objects.size, objects.rotation).corners()
 
 
+def box_edges() -> tuple[Tensor, list[bool]]:
+    """Return the corners that each edge joins, ``(12, 2)`` int64, and whether it belongs to the front."""
+    return _EDGES, [edge in _FRONT for edge in range(len(_EDGES))]
+
+
 def box_segments(objects: ObjectSet, camera: Cameras) -> list[list[tuple[float, float, float, float, bool]]]:
     """Project each box's edges.
 

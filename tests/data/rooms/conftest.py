@@ -3,10 +3,14 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 
+from raytran.data.rooms.cad import RECIPES, sample_model
 from raytran.data.rooms.scene import RoomSettings, make_scene
+from raytran.data.shapenet_write import write_model
 
 
 @pytest.fixture(scope="session")
@@ -24,3 +28,17 @@ def settings():
 @pytest.fixture(scope="session")
 def scenes(settings):
     return [make_scene(settings, np.random.default_rng([settings.seed, number])) for number in range(6)]
+
+
+@pytest.fixture(scope="session")
+def cads(tmp_path_factory):
+    """Return models of every class, half of each for either split, that no pool generates."""
+    root = tmp_path_factory.mktemp("cads")
+    for category in RECIPES:
+        for seed in range(4):
+            model = sample_model(category, np.random.default_rng([9, seed]))
+            path = write_model(model, root) / "model_normalized.json"
+            split = ("train", "val")[seed % 2]
+            path.write_text(json.dumps(json.loads(path.read_text()) | {"unit": "m", "split": split}))
+    (root / "credits.csv").write_text("model,creator\n")
+    return root

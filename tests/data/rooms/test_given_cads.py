@@ -10,7 +10,7 @@ import shutil
 import numpy as np
 import pytest
 
-from raytran.data.rooms.cad import RECIPES, finish_model, sample_model
+from raytran.data.rooms.cad import RECIPES, finish_model
 from raytran.data.rooms.generate import generate_rooms
 from raytran.data.rooms.library import read_library
 from raytran.data.rooms.pool import FEW, ModelPool
@@ -29,20 +29,6 @@ def digests(root):
         for path in sorted(root.rglob("*"))
         if path.is_file()
     }
-
-
-@pytest.fixture(scope="module")
-def cads(tmp_path_factory):
-    """Return models of every class, half of each for either split, that no pool generates."""
-    root = tmp_path_factory.mktemp("cads")
-    for category in RECIPES:
-        for seed in range(4):
-            model = sample_model(category, np.random.default_rng([9, seed]))
-            path = write_model(model, root) / "model_normalized.json"
-            split = ("train", "val")[seed % 2]
-            path.write_text(json.dumps(json.loads(path.read_text()) | {"unit": "m", "split": split}))
-    (root / "credits.csv").write_text("model,creator\n")
-    return root
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,7 @@ EVERY_TWO_STEPS = {"max_steps": 4, "val_check_interval": 2, "check_val_every_n_e
         ("stage1", {"occupancy.png", "topdown.png", "boxes.jpg"}),
         ("stage2", {"occupancy.png", "masks.jpg", "topdown.png", "boxes.jpg"}),
         ("stage3", {"topdown.png", "boxes.jpg"}),
+        ("novel_view", {"new_views.jpg", "topdown.png", "boxes.jpg"}),
     ],
 )
 def test_each_stage_shows_what_it_predicts(experiment, names, fit, tmp_path, monkeypatch):

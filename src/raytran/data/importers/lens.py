@@ -14,10 +14,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from raytran.data.images import MAX_SIDE
 from raytran.errors import DataError
-
-MAX_SIDE = 8192
-"""Pixels; an image that claims a longer side is refused before it is decoded."""
 
 _SAME_PX = 0.25
 """Largest shift of a pixel for which an image is used as it is."""

@@ -59,7 +59,7 @@ def read_nerfstudio(path: Path) -> Source:
     frames = content.get("frames")
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise DataError(f"{listed} lists no frames: export it again")
-    undo = _undo(content, listed)
+    undo = undo_applied(content, listed)
     images = [_image(frame, f"frame {i} of {listed}", listed) for i, frame in enumerate(frames)]
     told = all("w" in facts and "h" in facts for facts in ({**content, **frame} for frame in frames))
     size = None if told else stored_size(images)
@@ -92,6 +92,21 @@ def _shot(
     where: str,
     root: Path,
 ) -> Shot:
+    pose, lens = frame_pose(facts, undo, where), frame_lens(facts, size, where)
+    return Shot(frame_name(image.relative_to(root).as_posix()), image, pose, lens)
+
+
+def frame_pose(facts: Mapping[str, Any], undo: NDArray[np.float64], where: str) -> NDArray[np.float64]:
+    """Return the pose ``(4, 4)`` of a frame, camera-to-world in OpenGL axes.
+
+    Args:
+        facts: of the frame.
+        undo: what ``undo_applied`` returned.
+        where: name of the frame in messages.
+
+    Raises:
+        DataError: it has no matrix of 16 numbers.
+    """
     matrix = numbers(facts, "transform_matrix", where, (-1, 4))
     if matrix.shape not in ((3, 4), (4, 4)):
         raise DataError(f"{where} has a transform_matrix of {matrix.size} numbers, not 16: export it again")
@@ -99,10 +114,20 @@ def _shot(
     pose[:3] = undo @ np.vstack([matrix[:3], [0, 0, 0, 1]])
     # The scale undone is of the world, not of the camera's axes.
     pose[:3, :3] /= np.cbrt(abs(np.linalg.det(undo[:, :3])))
-    return Shot(frame_name(image.relative_to(root).as_posix()), image, pose, _lens(facts, size, where))
+    return pose
 
 
-def _lens(facts: Mapping[str, Any], size: tuple[int, int] | None, where: str) -> Lens:
+def frame_lens(facts: Mapping[str, Any], size: tuple[int, int] | None, where: str) -> Lens:
+    """Return the lens of a frame.
+
+    Args:
+        facts: of the frame and of all frames.
+        size: ``(H, W)`` of its image, if the facts do not say.
+        where: name of the frame in messages.
+
+    Raises:
+        DataError: a number is missing or odd, or the lens is a fisheye.
+    """
     model = str(facts.get("camera_model", "OPENCV")).upper()
     if facts.get("is_fisheye") or model not in (*_PINHOLES, *_DISTORTED):
         raise DataError(
@@ -136,8 +161,12 @@ def _focal(facts: Mapping[str, Any], key: str, angle_key: str, side: int, where:
     return side / (2 * math.tan(angle / 2))
 
 
-def _undo(content: Mapping[str, Any], listed: Path) -> NDArray[np.float64]:
-    """Return ``(3, 4)`` what takes the file's world back to the one before it was transformed."""
+def undo_applied(content: Mapping[str, Any], listed: Path) -> NDArray[np.float64]:
+    """Return ``(3, 4)`` what takes the file's world back to the one before it was transformed.
+
+    Raises:
+        DataError: it cannot be taken back.
+    """
     applied = np.eye(4)
     if "applied_transform" in content:
         matrix = numbers(content, "applied_transform", str(listed), (-1, 4))

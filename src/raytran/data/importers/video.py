@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from raytran.data.images import resize
+from raytran.data.images import MAX_SIDE, resize
 from raytran.data.importers.imported import ImportedScan, Pictures, Shot, Source, assemble
-from raytran.data.importers.lens import MAX_SIDE
 from raytran.data.importers.trajectory import (
     INTRINSICS_NAMES,
     TRACK_NAMES,

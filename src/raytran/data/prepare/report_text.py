@@ -52,7 +52,7 @@ def report_text(report: Mapping[str, Any]) -> str:
     left_out = [line for key, what in _LEFT_OUT.items() for line in _named(what, report["left_out"][key])]
     left_out += _objects_left_out(report["left_out"]["objects"])
     noticed = [line for key, what in _NOTICED.items() for line in _named(what, report["noticed"][key])]
-    lines = [*_counts(report), "", *_classes(report["objects"]), ""]
+    lines = [*_counts(report), "", *class_table(report["objects"]), ""]
     lines += ["Left out", *(left_out or ["  nothing"]), "Noticed", *(noticed or ["  nothing"])]
     return "\n".join(lines) + "\n"
 
@@ -91,7 +91,7 @@ def _paper(split: str) -> str:
     return f" (paper {PAPER_SCENES[split]})" if split in PAPER_SCENES else ""
 
 
-def _classes(objects: Mapping[str, Mapping[str, int]]) -> Iterable[str]:
+def class_table(objects: Mapping[str, Mapping[str, int]]) -> Iterable[str]:
     """Return a table: a row for each class, a column for each split, and the paper's validation scans."""
     columns = dict(objects) | ({"val, paper": PAPER_VAL_OBJECTS} if "val" in objects else {})
     yield "Objects  " + " " * 11 + "".join(f"{name:>12}" for name in columns)

@@ -7,7 +7,8 @@ import json
 import logging
 import time
 from collections import Counter
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ import numpy as np
 
 from raytran.data.atomic import UNFINISHED, sweep, write_text
 from raytran.data.rooms.library import digest_of, list_models, read_library, survey, write_library
-from raytran.data.rooms.pool import ModelPool
+from raytran.data.rooms.pool import MODELS_PER_CLASS, ModelPool
 from raytran.data.rooms.scene import RoomSettings, make_scene
 from raytran.data.rooms.write import annotation_path, write_scene
 from raytran.data.workers import work_on
@@ -34,6 +35,32 @@ _NOTICES = ("credits.csv", "LICENCES.txt")
 
 
 @dataclass(frozen=True)
+class RoomSplit:
+    """What the rooms of one split are made of.
+
+    Attributes:
+        name: ``train``, ``val`` or ``test``.
+        numbers: of its scans; a room follows from the seed and its number.
+        frames: pictures with a valid pose in each scan.
+        models: numbers of the generated models of each class that its rooms draw from.
+        textures: which draw of the textures its rooms are painted with.
+        given: whose of given CAD models its rooms draw from, ``train`` or ``val``; None for all.
+    """
+
+    name: str
+    numbers: range
+    frames: int
+    models: range = range(MODELS_PER_CLASS)
+    textures: int = 0
+    given: str | None = "train"
+
+    @property
+    def scan_ids(self) -> tuple[str, ...]:
+        """The names of its scans, in order."""
+        return tuple(scan_name(number) for number in self.numbers)
+
+
+@dataclass(frozen=True)
 class RoomsReport:
     """What a call of ``generate_rooms`` did.
 
@@ -45,6 +72,7 @@ class RoomsReport:
         objects: objects in all scans together.
         seconds: wall-clock time.
         cads_left_out: ``catid/id`` of given CAD models that cannot be used, with the reason.
+        test: scans that are held out from every choice, too.
     """
 
     root: Path
@@ -54,6 +82,12 @@ class RoomsReport:
     objects: int
     seconds: float
     cads_left_out: dict[str, str] = field(default_factory=dict)
+    test: tuple[str, ...] = ()
+
+
+def scan_name(number: int) -> str:
+    """Return the name of the scan with this number, in ScanNet's form."""
+    return f"scene{number:04d}_00"
 
 
 def generate_rooms(
@@ -100,45 +134,72 @@ def generate_rooms(
     """
     settings = RoomSettings(seed, frames, image_size, min_objects, max_objects, room_size)
     _check(settings, num_train, num_val)
-    cads = None if cads is None else Path(cads).resolve()
-    return _generate(Path(output).resolve(), settings, (num_train, num_val), cads, processes, progress)
+    train = RoomSplit("train", range(num_train), frames)
+    val = RoomSplit("val", range(num_train, num_train + num_val), frames, given="val")
+    claim = {"format": FORMAT, "num_train": num_train, "num_val": num_val, **asdict(settings)}
+    return make_splits(
+        output, settings, (train, val), claim=claim, cads=cads, processes=processes, progress=progress
+    )
 
 
-def _generate(
+def make_splits(
     output: Path,
     settings: RoomSettings,
-    numbers: tuple[int, int],
-    cads: Path | None,
-    processes: int,
-    progress: bool,
+    splits: Sequence[RoomSplit],
+    *,
+    claim: dict[str, Any],
+    cads: Path | None = None,
+    processes: int = 0,
+    progress: bool = True,
 ) -> RoomsReport:
+    """Make the rooms of some splits and the lists of them, or finish what was begun.
+
+    Args:
+        output: as of ``generate_rooms``.
+        settings: of all rooms, except that each split has its own number of frames.
+        splits: whose numbers do not meet.
+        claim: what ``rooms.json`` says of the data set; one of another claim is left alone.
+        cads: as of ``generate_rooms``, and so are ``processes`` and ``progress``.
+        processes: see there.
+        progress: see there.
+
+    Raises:
+        DataError: as ``generate_rooms``.
+    """
     started = time.monotonic()
-    num_train, num_val = numbers
-    asked = {"format": FORMAT, "num_train": num_train, "num_val": num_val, **asdict(settings)}
-    _claim(output, asked if cads is None else asked | {"cads": digest_of(list_models(cads))})
+    output, cads = Path(output).resolve(), None if cads is None else Path(cads).resolve()
+    _claim(output, claim if cads is None else claim | {"cads": digest_of(list_models(cads))})
     left_out = {} if cads is None else _look_through(output, cads, processes, progress)
-    scan_ids = [f"scene{number:04d}_00" for number in range(num_train + num_val)]
     scans = output / "scannet" / "scans"
     scans.mkdir(parents=True, exist_ok=True)
     sweep(scans, f"{UNFINISHED}*")
-    missing = [number for number, scan_id in enumerate(scan_ids) if not (scans / scan_id).is_dir()]
-    make = partial(make_room_scan, output, settings, num_train=num_train, cads=cads)
+    rooms = [(split, number) for split in splits for number in split.numbers]
+    missing = [(split, number) for split, number in rooms if not (scans / scan_name(number)).is_dir()]
+    make = partial(_make_scan, output, settings, cads)
     for _ in work_on(missing, make, label="rooms", processes=processes, progress=progress):
         pass
-    objects = _write_lists(output, scan_ids, num_train)
-    train, val = tuple(scan_ids[:num_train]), tuple(scan_ids[num_train:])
-    return RoomsReport(output, train, val, len(missing), objects, time.monotonic() - started, left_out)
+    objects = _write_lists(output, splits)
+    named = {split.name: split.scan_ids for split in splits}
+    return RoomsReport(
+        root=output,
+        train=named.get("train", ()),
+        val=named.get("val", ()),
+        test=named.get("test", ()),
+        made=len(missing),
+        objects=objects,
+        seconds=time.monotonic() - started,
+        cads_left_out=left_out,
+    )
 
 
-def make_room_scan(
-    output: Path, settings: RoomSettings, number: int, *, num_train: int, cads: Path | None = None
-) -> int:
-    """Make and write the scan with this number; return how many objects it has."""
+def _make_scan(output: Path, settings: RoomSettings, cads: Path | None, which: tuple[RoomSplit, int]) -> int:
+    """Make and write the scan of a split with this number; return how many objects it has."""
+    split, number = which
     rng = np.random.default_rng([settings.seed, number])
     library = None if cads is None else read_library(output / _CADS, cads)
-    pool = ModelPool(settings.seed, library, "train" if number < num_train else "val")
-    scene = make_scene(settings, rng, pool)
-    return write_scene(scene, scan_id=f"scene{number:04d}_00", root=output, rng=rng)
+    pool = ModelPool(settings.seed, library, split.given, split.models)
+    scene = make_scene(replace(settings, frames=split.frames), rng, pool, textures=split.textures)
+    return write_scene(scene, scan_id=scan_name(number), root=output, rng=rng)
 
 
 def _look_through(output: Path, cads: Path, processes: int, progress: bool) -> dict[str, str]:
@@ -193,10 +254,12 @@ def _claim(output: Path, asked: dict[str, Any]) -> None:
     write_text(path, json.dumps(asked, indent=2) + "\n")
 
 
-def _write_lists(output: Path, scan_ids: list[str], num_train: int) -> int:
+def _write_lists(output: Path, splits: Sequence[RoomSplit]) -> int:
     """Write the split files and the annotations of all scans; return the number of objects."""
     entries = [
-        json.loads(annotation_path(output, scan_id).read_text(encoding="utf-8")) for scan_id in scan_ids
+        json.loads(annotation_path(output, scan_id).read_text(encoding="utf-8"))
+        for split in splits
+        for scan_id in split.scan_ids
     ]
     write_text(output / "scan2cad" / "full_annotations.json", json.dumps(entries))
     counts = {
@@ -204,8 +267,7 @@ def _write_lists(output: Path, scan_ids: list[str], num_train: int) -> int:
         for entry in entries
     }
     write_text(output / "scan2cad" / "cad_appearances.json", json.dumps(counts, indent=1))
-    for split, chosen in (("train", scan_ids[:num_train]), ("val", scan_ids[num_train:])):
-        write_text(
-            output / "scannet" / f"scannetv2_{split}.txt", "".join(f"{scan_id}\n" for scan_id in chosen)
-        )
+    for split in splits:
+        path = output / "scannet" / f"scannetv2_{split.name}.txt"
+        write_text(path, "".join(f"{scan_id}\n" for scan_id in split.scan_ids))
     return sum(entry["n_aligned_models"] for entry in entries)

@@ -86,10 +86,10 @@ _LEVEL_START = np.concatenate([[0], np.cumsum([(SIZE >> level) ** 2 for level in
 )
 
 
-@lru_cache(maxsize=1)
-def texture_library() -> TextureLibrary:
-    """Return the textures, made once per process and the same in every process."""
-    rng = np.random.default_rng(_SEED)
+@lru_cache(maxsize=3)
+def texture_library(draw: int = 0) -> TextureLibrary:
+    """Return one of any number of draws of all textures, the same in every process."""
+    rng = np.random.default_rng([_SEED, draw] if draw else _SEED)
     texels: list[NDArray[np.float32]] = []
     for name in _NAMES:
         image = _draw(name, rng).clip(0.0, 1.0).astype(np.float32)

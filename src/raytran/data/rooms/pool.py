@@ -14,7 +14,7 @@ from raytran.data.rooms.library import CadLibrary
 from raytran.types import CLASSES
 
 MODELS_PER_CLASS = 100
-"""Generated models of one class that the rooms of one seed share, as scans share those of Scan2CAD."""
+"""Generated models of one class that the rooms of one split share, as scans share those of Scan2CAD."""
 
 FEW = 5
 """Where a library has fewer models of what is wanted, generated ones make up this number."""
@@ -27,12 +27,14 @@ class ModelPool:
     Attributes:
         seed: seed of the rooms.
         library: CAD models given; None for generated ones alone.
-        split: whose models of the library are drawn, ``train`` or ``val``.
+        split: whose models of the library are drawn, ``train`` or ``val``; None for all.
+        numbers: of the generated models of each class.
     """
 
     seed: int
     library: CadLibrary | None = None
-    split: str = "train"
+    split: str | None = "train"
+    numbers: range = range(MODELS_PER_CLASS)
 
     def draw(
         self, category: str, rng: np.random.Generator, *, kinds: Collection[str] = ()
@@ -42,7 +44,7 @@ class ModelPool:
             given = [
                 model
                 for model in self.library.models
-                if model.split == self.split
+                if self.split in (None, model.split)
                 and model.category == category
                 and (not kinds or model.kind in kinds)
             ]
@@ -52,7 +54,7 @@ class ModelPool:
             number = int(rng.integers(max(len(given), FEW if generated else 0)))
             if number < len(given):
                 return self.library.load(given[number])
-        for number in rng.integers(MODELS_PER_CLASS, size=60):
+        for number in rng.integers(self.numbers.start, self.numbers.stop, size=60):
             model = _generated(self.seed, category, int(number))
             if not kinds or model.kind in kinds:
                 return model
@@ -60,8 +62,8 @@ class ModelPool:
 
     def has(self, kind: str) -> bool:
         """Say whether the library, in this split, has a model of a kind."""
-        library = self.library
-        return library is not None and any(m.kind == kind and m.split == self.split for m in library.models)
+        models = () if self.library is None else self.library.models
+        return any(model.kind == kind and self.split in (None, model.split) for model in models)
 
 
 @lru_cache(maxsize=2048)

@@ -15,7 +15,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from raytran.data.rooms.materials import texture_library
+from raytran.data.rooms.materials import TextureLibrary, texture_library
 from raytran.data.rooms.room import Light
 from raytran.data.rooms.surfaces import Surfaces
 
@@ -61,12 +61,15 @@ class Renderer:
     Args:
         surfaces: the room and its furniture.
         lights: lamps and daylight.
+        textures: of the surfaces; None for the first draw.
     """
 
-    def __init__(self, *, surfaces: Surfaces, lights: Sequence[Light]) -> None:
+    def __init__(
+        self, *, surfaces: Surfaces, lights: Sequence[Light], textures: TextureLibrary | None = None
+    ) -> None:
         self._surfaces = surfaces
         self._lights = tuple(lights)
-        self._textures = texture_library()
+        self._textures = textures or texture_library()
         self._scene = EmbreeScene()
         TriangleMesh(self._scene, np.ascontiguousarray(surfaces.triangles))
         edges = surfaces.triangles[:, 1:] - surfaces.triangles[:, :1]

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import colorsys
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from raytran.data.rooms.cameras import make_intrinsics, plan_path
 from raytran.data.rooms.collision import Boxes
 from raytran.data.rooms.furnish import ROOM_KINDS, Furnisher
 from raytran.data.rooms.layout import Layout
-from raytran.data.rooms.materials import texture_index
+from raytran.data.rooms.materials import texture_index, texture_library
 from raytran.data.rooms.placed import FLOOR, PlacedObject
 from raytran.data.rooms.pool import ModelPool
 from raytran.data.rooms.render import Pinhole, Renderer
@@ -64,13 +65,16 @@ class Scene:
     scan_from_room: NDArray[np.float64]
 
 
-def make_scene(settings: RoomSettings, rng: np.random.Generator, pool: ModelPool | None = None) -> Scene:
+def make_scene(
+    settings: RoomSettings, rng: np.random.Generator, pool: ModelPool | None = None, *, textures: int = 0
+) -> Scene:
     """Draw a scene in which every object is seen in several frames.
 
     Args:
         settings: what all rooms have in common.
         rng: source of all choices.
         pool: where the furniture comes from; None for generated models.
+        textures: which draw of the textures is used.
 
     Raises:
         ConfigError: no such scene was found, as when many objects are asked of a tiny room.
@@ -78,7 +82,9 @@ def make_scene(settings: RoomSettings, rng: np.random.Generator, pool: ModelPool
     pool = pool or ModelPool(settings.seed)
     for _ in range(_ATTEMPTS):
         layout = _furnished(settings, pool, rng)
-        scene = _filmed(settings, layout, rng) if len(layout.objects) >= settings.min_objects else None
+        if len(layout.objects) < settings.min_objects:
+            continue
+        scene = _filmed(settings, layout, rng, textures)
         if scene is not None:
             return scene
     (a, b), (c, d) = settings.room_size
@@ -102,10 +108,10 @@ def _furnished(settings: RoomSettings, pool: ModelPool, rng: np.random.Generator
     return layout
 
 
-def _filmed(settings: RoomSettings, layout: Layout, rng: np.random.Generator) -> Scene | None:
+def _filmed(settings: RoomSettings, layout: Layout, rng: np.random.Generator, textures: int) -> Scene | None:
     """Walk through the room and take out what is not seen often enough; None if too little remains."""
     paints = [_paint_object(placed, rng) for placed in layout.objects]
-    renderer = _make_renderer(layout.room, layout.objects, paints)
+    renderer = _make_renderer(layout.room, layout.objects, paints, textures)
     cameras, missed = plan_path(
         room=layout.room,
         boxes=Boxes.joined([placed.box for placed in layout.objects]),
@@ -122,7 +128,7 @@ def _filmed(settings: RoomSettings, layout: Layout, rng: np.random.Generator) ->
         objects = tuple(
             replace(layout.objects[i], parent=_new_number(kept, layout.objects[i].parent)) for i in kept
         )
-        renderer = _make_renderer(layout.room, objects, [paints[i] for i in kept])
+        renderer = _make_renderer(layout.room, objects, [paints[i] for i in kept], textures)
     else:
         objects = tuple(layout.objects)
     renderer.expose(cameras[:: max(1, len(cameras) // 6)], brightness=rng.uniform(0.35, 0.55))
@@ -155,13 +161,13 @@ def _draw_scan_frame(room: Room, rng: np.random.Generator) -> NDArray[np.float64
 
 
 def _make_renderer(
-    room: Room, objects: list[PlacedObject] | tuple[PlacedObject, ...], paints: list[list[Paint]]
+    room: Room, objects: Sequence[PlacedObject], paints: list[list[Paint]], textures: int
 ) -> Renderer:
     parts = [room.surfaces]
     for number, (placed, paint) in enumerate(zip(objects, paints, strict=True)):
         triangles, group = placed.triangles(), placed.model.face_group
         parts += [Surfaces.painted(triangles[group == i], paint[i], owner=number) for i in range(len(paint))]
-    return Renderer(surfaces=Surfaces.joined(parts), lights=room.lights)
+    return Renderer(surfaces=Surfaces.joined(parts), lights=room.lights, textures=texture_library(textures))
 
 
 def _paint_object(placed: PlacedObject, rng: np.random.Generator) -> list[Paint]:

@@ -18,6 +18,7 @@ from scipy.spatial import QhullError
 from raytran.data.atomic import finished_folder, no_room
 from raytran.data.collate import collate_scenes
 from raytran.data.views import choose_even
+from raytran.model import inputs_of
 from raytran.postprocess import select_objects
 from raytran.training.reconstruction import Reconstruction
 from raytran.training.scores import DUPLICATE_IOU, SCORE_THRESHOLD
@@ -77,9 +78,8 @@ class ScenePictures(pl.Callback):
         stage, found = module.stage, []
         for index in chosen:
             batch = collate_scenes([dataset[index]])
-            views, center = batch.views.to(module.device), batch.grid_center.to(module.device)
             with module.trainer.precision_plugin.val_step_context():
-                raw = module.model(views, tasks=stage.tasks, grid_center=center)
+                raw = module.model(**inputs_of(batch.to(module.device)), tasks=stage.tasks)
             (prediction,) = module.model.decode(raw, batch.scene_id, with_shapes="shape" in stage.terms)
             prediction = select_objects(
                 prediction, score_threshold=SCORE_THRESHOLD, duplicate_iou=DUPLICATE_IOU

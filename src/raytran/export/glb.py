@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One glTF file of a whole scene: meshes, boxes and cameras, each a node with a name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from raytran.export.mesh import object_name
+from raytran.geometry.camera import Cameras
+from raytran.types import CLASS_COLORS, CLASSES, ObjectSet
+
+WORLD = "world_z_up"
+"""Node above all others; it turns the world's +Z to glTF's +Y."""
+
+_Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+
+_EDGE = 0.008
+"""Thickness of a box's edges, metres; those of the front face are twice as thick."""
+
+_NEAR = 0.05
+"""Near plane of the cameras, metres."""
+
+
+def write_glb(
+    path: Path,
+    objects: ObjectSet,
+    meshes: Sequence[trimesh.Trimesh | None],
+    *,
+    cameras: Cameras | None = None,
+    frame_ids: Sequence[str] = (),
+) -> Path:
+    """Write a scene as glTF; a mesh is the node ``NN_class``, its object's box the node ``NN_class_box``.
+
+    Geometry keeps the world coordinates of the poses (+Z up); the parent node ``world_z_up`` turns them to
+    glTF's +Y up, so that every viewer shows the room upright. A box is its twelve edges as thin bars, those
+    of the front bolder. Each frame is a glTF camera in the node ``camera_FRAME`` below the node ``cameras``;
+    glTF knows no principal point, so one beside the middle of the image is lost.
+
+    Args:
+        path: the file.
+        objects: ``M`` objects.
+        meshes: for each object its mesh in world coordinates, or None.
+        cameras: ``(N,)`` cameras of the frames used, or None.
+        frame_ids: the name of each of the ``N`` frames.
+
+    Returns:
+        ``path``.
+    """
+    scene = trimesh.Scene()
+    scene.graph.update(frame_from=scene.graph.base_frame, frame_to=WORLD, matrix=_Y_UP_FROM_Z_UP)
+    for i, mesh in enumerate(meshes):
+        label, name = int(objects.label[i]), object_name(objects, i)
+        if mesh is not None:
+            _add(scene, name, trimesh.Trimesh(mesh.vertices, mesh.faces, process=False), label)
+        _add(scene, f"{name}_box", _box_edges(objects, i), label)
+
+    def complete(tree: dict[str, Any]) -> None:
+        for material in tree.get("materials", ()):
+            color = _linear(CLASS_COLORS[CLASSES.index(material["name"])])
+            material["pbrMetallicRoughness"]["baseColorFactor"] = [*color, 1.0]
+        if cameras is not None:
+            _add_cameras(tree, cameras, frame_ids)
+
+    # `Scene.export` refuses a scene without geometry; a file with no objects in it is what we mean.
+    content = trimesh.exchange.gltf.export_glb(scene, include_normals=True, tree_postprocessor=complete)
+    path.write_bytes(content)
+    return path
+
+
+def _linear(color: Sequence[int]) -> list[float]:
+    """Return a colour of display values in [0, 255] as glTF wants it: linear light (IEC 61966-2-1)."""
+    values = [value / 255 for value in color]
+    return [value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4 for value in values]
+
+
+def _add(scene: trimesh.Scene, name: str, solid: trimesh.Trimesh, label: int) -> None:
+    # Its colour is set in the finished file: trimesh rounds colours to 256 steps, too few for linear light.
+    material = trimesh.visual.material.PBRMaterial(
+        name=CLASSES[label],
+        baseColorFactor=[*CLASS_COLORS[label], 255],
+        metallicFactor=0.0,
+        roughnessFactor=0.8,
+        doubleSided=True,
+    )
+    solid.visual = trimesh.visual.TextureVisuals(material=material)
+    scene.add_geometry(solid, node_name=name, geom_name=name, parent_node_name=WORLD)
+
+
+def _box_edges(objects: ObjectSet, index: int) -> trimesh.Trimesh:
+    """Return the edges of an object's box as twelve bars, in the world."""
+    size, rotation, center = (
+        value[index].detach().double().cpu().numpy()
+        for value in (objects.size, objects.rotation, objects.center)
+    )
+    bar = trimesh.creation.box()
+    vertices: list[NDArray[np.float64]] = []
+    # An edge runs along one axis, at either end of the two others.
+    for axis, *ends in product(range(3), (-0.5, 0.5), (-0.5, 0.5)):
+        place = np.insert(np.array(ends, dtype=np.float64), axis, 0.0)
+        thickness = _EDGE * (2 if place[2] < 0 else 1)
+        extents = np.full(3, thickness)
+        extents[axis] += size[axis]
+        vertices.append(bar.vertices * extents + place * size)
+    faces = [bar.faces + i * len(bar.vertices) for i in range(len(vertices))]
+    corners = np.concatenate(vertices) @ rotation.T + center
+    return trimesh.Trimesh(corners, np.concatenate(faces), process=False)
+
+
+def _add_cameras(tree: dict[str, Any], cameras: Cameras, frame_ids: Sequence[str]) -> None:
+    """Add a camera for each frame to glTF's JSON; a glTF camera looks along its own -Z, with +Y up."""
+    height, width = cameras.image_size
+    nodes: list[dict[str, Any]] = tree["nodes"]
+    world = next(node for node in nodes if node.get("name") == WORLD)
+    poses = cameras.world_from_camera.double().cpu().numpy() * np.array([1.0, -1, -1, 1])
+    first = len(nodes) + 1
+    nodes.append({"name": "cameras", "children": list(range(first, first + len(poses)))})
+    world.setdefault("children", []).append(first - 1)
+    focal = cameras.intrinsics[:, [0, 1], [0, 1]].double().tolist()
+    tree["cameras"] = [
+        {
+            "type": "perspective",
+            "perspective": {
+                "yfov": 2 * math.atan(height / 2 / along_y),
+                "aspectRatio": width / along_x / (height / along_y),
+                "znear": _NEAR,
+            },
+        }
+        for along_x, along_y in focal
+    ]
+    for n, (name, pose) in enumerate(zip(frame_ids, poses, strict=True)):
+        # glTF's matrices are column-major.
+        nodes.append({"name": f"camera_{name}", "camera": n, "matrix": pose.T.ravel().tolist()})

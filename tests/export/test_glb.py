@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The glTF scene in two programs that read it: names, places, colours, cameras."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import struct
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from raytran.export.glb import write_glb
+from raytran.types import ObjectSet
+
+NODES = {"00_chair", "00_chair_box", "01_table_box"}
+
+# The chair's box is 0.5 x 0.6 m on the floor, turned by 30 degrees round (1, 2), and 1 m high; the edges of
+# its front are 16 mm thick, those behind 8 mm.
+HALF_X, HALF_Y = 0.25 * 0.866 + 0.3 * 0.5, 0.25 * 0.5 + 0.3 * 0.866
+
+
+@pytest.fixture
+def glb(tmp_path, prediction, box_at, cameras) -> Path:
+    return write_glb(
+        tmp_path / "scene.glb",
+        prediction.objects,
+        [box_at([1, 2, 0.5]), None],
+        cameras=cameras,
+        frame_ids=["0", "5"],
+    )
+
+
+def content(path: Path) -> dict:
+    data = path.read_bytes()
+    return json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
+
+
+def test_trimesh_finds_every_node_in_its_place(glb):
+    scene = trimesh.load(glb)
+    assert set(scene.graph.nodes_geometry) == NODES
+    world_from_node, geometry = scene.graph["00_chair"]
+    assert np.allclose(scene.geometry[geometry].bounds, [[0.75, 1.7, 0.0], [1.25, 2.3, 1.0]], atol=1e-6)
+    # The world's +Z is glTF's +Y, and the turn is proper.
+    assert np.allclose(world_from_node[:3, :3] @ [0, 0, 1], [0, 1, 0])
+    assert np.linalg.det(world_from_node[:3, :3]) == pytest.approx(1)
+    box = scene.geometry[scene.graph["00_chair_box"][1]]
+    assert np.allclose(box.bounds, [[1 - HALF_X, 2 - HALF_Y, 0], [1 + HALF_X, 2 + HALF_Y, 1]], atol=0.015)
+    assert len(box.split()) == 12
+    # The front is at -Z of the object, which is (-sin 30, cos 30, 0) from its middle.
+    front = (box.triangles_center - [1, 2, 0.5]) @ [-0.5, 0.866, 0] > 0.25
+    assert box.area_faces[front].sum() > 1.3 * box.area_faces[~front].sum() / 2
+
+
+def test_colours_are_linear_light(glb):
+    colors = {m["name"]: m["pbrMetallicRoughness"]["baseColorFactor"] for m in content(glb)["materials"]}
+    # (31, 119, 180) and (44, 160, 44) by IEC 61966-2-1.
+    assert colors["chair"] == pytest.approx([0.01370, 0.18447, 0.45641, 1], abs=1e-4)
+    assert colors["table"] == pytest.approx([0.02519, 0.35153, 0.02519, 1], abs=1e-4)
+
+
+def test_cameras_look_where_the_frames_do(glb):
+    tree = content(glb)
+    nodes = {node["name"]: node for node in tree["nodes"]}
+    assert [tree["nodes"][i]["name"] for i in nodes["cameras"]["children"]] == ["camera_0", "camera_5"]
+    pose = np.array(nodes["camera_5"]["matrix"]).reshape(4, 4).T
+    assert np.allclose(pose[:3, 3], [0.25, -3, 1.5])
+    assert np.allclose(pose[:3, :3] @ [0, 0, -1], [0, 1, 0])  # glTF's forward
+    assert np.allclose(pose[:3, :3] @ [0, 1, 0], [0, 0, 1])  # and up
+    lens = tree["cameras"][1]["perspective"]
+    assert np.tan(lens["yfov"] / 2) == pytest.approx(60 / 120)
+    assert lens["aspectRatio"] * np.tan(lens["yfov"] / 2) == pytest.approx(80 / 100)
+
+
+def test_an_empty_scene_loads(tmp_path):
+    path = write_glb(tmp_path / "scene.glb", ObjectSet.empty(), [])
+    assert not trimesh.load(path).geometry
+    assert [node["name"] for node in content(path)["nodes"]] == ["world_z_up"]
+
+
+def test_three_js_finds_the_same(glb):
+    """Needs Node.js and three (``npm install three``, found from here or through ``NODE_PATH``)."""
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("node is not installed")
+    script = Path(__file__).with_name("read_glb.mjs")
+    run = subprocess.run([node, script, glb], capture_output=True, text=True, timeout=60, check=False)
+    if "Cannot find module 'three" in run.stderr:
+        pytest.skip("three is not installed: npm install three")
+    assert run.returncode == 0, run.stderr
+    found = json.loads(run.stdout)
+    meshes = {name: entry for name, entry in found.items() if entry["type"] == "Mesh"}
+    assert set(meshes) == NODES
+    # Three's world is glTF's, +Y up: (x, y, z) of ours is (x, z, -y) there.
+    assert np.allclose(meshes["00_chair"]["low"], [0.75, 0, -2.3], atol=1e-5)
+    assert np.allclose(meshes["00_chair"]["high"], [1.25, 1, -1.7], atol=1e-5)
+    assert np.allclose(meshes["00_chair_box"]["low"], [1 - HALF_X, 0, -2 - HALF_Y], atol=0.015)
+    assert meshes["00_chair"]["color"] == "1f77b4"
+    cameras = {name: entry for name, entry in found.items() if entry["type"] == "PerspectiveCamera"}
+    assert set(cameras) == {"camera_0", "camera_5"}
+    assert np.allclose(cameras["camera_5"]["position"], [0.25, 1.5, 3])
+    assert np.allclose(cameras["camera_5"]["forward"], [0, 0, -1], atol=1e-6)
+    assert cameras["camera_5"]["aspect"] == pytest.approx((80 / 100) / (60 / 120))

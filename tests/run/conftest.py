@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A checkpoint for the commands that take one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+import torch
+
+from raytran.model import RayTran
+from raytran.run.build import build_model, plain
+from raytran.run.checkpoint import checkpoint_card
+from raytran.run.entry import compose
+from raytran.training.checkpoint_file import write_checkpoint
+
+
+class Trained(NamedTuple):
+    """A checkpoint as training writes it, and the network in it."""
+
+    path: Path
+    model: RayTran
+
+
+@pytest.fixture(scope="package")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    settings = [
+        "preset=tiny",
+        "model.grid_resolution=[8,8,4]",
+        "model.backbone.resnet.weights=/home/me/resnet.pth",
+    ]
+    config = compose("train", [*settings, "data.root=/home/me/rooms", f"output_dir={folder}"])
+    model = build_model(config, pretrained=False)
+    parent = {"path": "/home/me/stage2/last.ckpt", "stage": "joint", "step": 3, "scores": {"val/loss": 1.0}}
+    card = checkpoint_card(stage="shape", preset="tiny", config=plain(config), parent=parent)
+    state = {f"model.{name}": value for name, value in model.state_dict().items()}
+    more = {"scores": {"val/objects/f1_0.25": 0.5}, "global_step": 40, "optimizer_states": [{}]}
+    path = folder / "last.ckpt"
+    write_checkpoint(path, {**card, **more, "state_dict": {**state, "loss.scale": torch.ones(1)}})
+    return Trained(path, model)
