@@ -18,15 +18,16 @@ from rich.table import Table
 from raytran.errors import ConfigError
 from raytran.model import RayTran
 from raytran.run.build import build_data, plain
-from raytran.run.checkpoint import load_model
+from raytran.run.checkpoint import load_model, prediction_settings
 from raytran.run.curriculum import run_curriculum
-from raytran.run.demo_page import SPLITS, ShownScene, headline, write_page
+from raytran.run.demo_page import COLUMNS, ShownScene, headline, write_page
 from raytran.run.entry import compose
 from raytran.run.evaluate import TASKS_WITH_SHAPE, evaluate_model
 from raytran.run.predict import predict_scene
 from raytran.run.scene_files import write_scene
 from raytran.run.steps import StepTimes
 from raytran.run.train import FitResult
+from raytran.run.weights import shipped_weights
 from raytran.training.datamodule import SceneDataModule
 
 _log = logging.getLogger(__name__)
@@ -35,6 +36,30 @@ _RECORD = "demo.json"
 _RECORDED = ("preset", "seed", "model", "loss", "optimizer", "views", "rooms", "schedule")
 """Settings that a demo must share with the one it continues."""
 
+_SETTINGS = (
+    "experiment=stage2",
+    "data.val_views=${views.predict_views}",
+    "stage.targets=[occupancy,foreground,objects,shapes]",
+)
+"""All targets that are measured, and the views that a prediction takes."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A network, and the rooms it is asked about.
+
+    Attributes:
+        model: the network.
+        checkpoint: its file.
+        data: rooms, with the images and the grid that the network wants.
+        split: which of them.
+    """
+
+    model: RayTran
+    checkpoint: Path
+    data: SceneDataModule
+    split: str
+
 
 @dataclass(frozen=True)
 class DemoResult:
@@ -42,7 +67,7 @@ class DemoResult:
 
     Attributes:
         page: the HTML file.
-        metrics: content of ``metrics.json`` of the splits ``train`` and ``val``.
+        metrics: content of ``metrics.json`` of each of ``COLUMNS`` (``shipped`` only if raytran has weights).
         seconds: time of each step.
     """
 
@@ -67,11 +92,11 @@ def demo(cfg: DictConfig) -> DemoResult:
     with times.measure("rooms", continues=True):
         data.prepare_data()
     fits = _train(overrides, output / "training", times)
-    model = load_model(fits[-1].checkpoint)
+    asked = _asked(overrides, data, fits[-1].checkpoint)
     with times.measure("evaluation"):
-        metrics = {split: _evaluate(cfg, model, data, split, output, fits[-1]) for split in SPLITS}
+        metrics = {name: _evaluate(cfg, part, output / "evaluation" / name) for name, part in asked.items()}
     with times.measure("prediction"):
-        scenes = [_predict_first(cfg, model, data, split, output) for split in SPLITS]
+        scenes = [_predict_first(cfg, name, part, output) for name, part in asked.items()]
     with times.measure("page"):
         page = write_page(output, scenes=scenes, metrics=metrics, fits=fits, seconds=times.seconds)
     _tell(page, metrics, times.seconds)
@@ -84,9 +109,7 @@ def _data(overrides: Sequence[str], output: Path) -> SceneDataModule:
     Raises:
         ConfigError: ``output`` holds a demo with other settings.
     """
-    settings = ["experiment=stage2", "data.val_views=${views.predict_views}", f"output_dir={_quoted(output)}"]
-    settings.append("stage.targets=[occupancy,foreground,objects,shapes]")
-    cfg = compose("train", [*overrides, *settings])
+    cfg = compose("train", [*overrides, *_SETTINGS, f"output_dir={_quoted(output)}"])
     wanted = {
         name: value if isinstance(value := cfg[name], str | int) else plain(value) for name in _RECORDED
     }
@@ -111,42 +134,60 @@ def _train(overrides: Sequence[str], folder: Path, times: StepTimes) -> list[Fit
     return fits
 
 
-def _evaluate(
-    cfg: DictConfig, model: RayTran, data: SceneDataModule, split: str, output: Path, fit: FitResult
-) -> dict[str, Any]:
-    about = {"checkpoint": str(fit.checkpoint), "data": str(data.root), "split": split}
+def _asked(overrides: Sequence[str], data: SceneDataModule, checkpoint: Path) -> dict[str, Asked]:
+    """Return who is asked about what, by ``COLUMNS``: the package's weights too, if it has any."""
+    model = load_model(checkpoint)
+    asked = {split: Asked(model, checkpoint, data, split) for split in ("train", "val")}
+    shipped = shipped_weights()
+    if shipped is not None:
+        model, wanted = load_model(shipped), prediction_settings(shipped)
+        # The same rooms, as this network wants to see them.
+        fit = {
+            "views.image_size": wanted.image_size,
+            "model.grid_resolution": model.grid_resolution,
+            "model.grid_extent": model.grid_extent,
+        }
+        settings = [f"{name}={list(value)}" for name, value in fit.items()]
+        cfg = compose("train", [*overrides, *_SETTINGS, *settings])
+        asked["shipped"] = Asked(model, shipped, build_data(cfg), "val")
+    return asked
+
+
+def _evaluate(cfg: DictConfig, asked: Asked, output: Path) -> dict[str, Any]:
+    about = {"checkpoint": str(asked.checkpoint), "data": str(asked.data.root), "split": asked.split}
     return evaluate_model(
-        model,
-        data.split(split),
+        asked.model,
+        asked.data.split(asked.split),
         tasks=TASKS_WITH_SHAPE,
-        output=output / "evaluation" / split,
+        output=output,
         score_threshold=cfg.score_threshold,
         duplicate_iou=cfg.duplicate_iou,
         about=about,
     )
 
 
-def _predict_first(
-    cfg: DictConfig, model: RayTran, data: SceneDataModule, split: str, output: Path
-) -> ShownScene:
-    """Predict the first room of a split; write what ``raytran.predict`` writes, the truth in the plan."""
-    batch = data.split(split)[0]
+def _predict_first(cfg: DictConfig, name: str, asked: Asked, output: Path) -> ShownScene:
+    """Predict the first of the rooms; write what ``raytran.predict`` writes, the truth in the plan."""
+    batch = asked.data.split(asked.split)[0]
     found = predict_scene(
-        model,
+        asked.model,
         batch.views,
         scene_id=batch.scene_id[0],
         score_threshold=cfg.score_threshold,
         duplicate_iou=cfg.duplicate_iou,
     )
-    folder = output / "predictions" / batch.scene_id[0]
+    folder = output / "predictions" / (("shipped-" if name == "shipped" else "") + batch.scene_id[0])
     truth = None if batch.objects is None else batch.objects[0]
-    write_scene(folder, found, batch.views, batch.frame_id[0], grid_extent=model.grid_extent, truth=truth)
-    return ShownScene(split, folder, batch, found.prediction, model.grid_extent)
+    extent = asked.model.grid_extent
+    write_scene(folder, found, batch.views, batch.frame_id[0], grid_extent=extent, truth=truth)
+    return ShownScene(name, folder, batch, found.prediction, extent)
 
 
 def _tell(page: Path, metrics: Mapping[str, Mapping[str, Any]], seconds: Mapping[str, float]) -> None:
-    table = Table("", *SPLITS.values(), title=f"demo, {sum(seconds.values()) / 60:.1f} min")
-    columns = [headline(metrics[split]) for split in SPLITS]
+    table = Table(
+        "", *(COLUMNS[name] for name in metrics), title=f"demo, {sum(seconds.values()) / 60:.1f} min"
+    )
+    columns = [headline(entry) for entry in metrics.values()]
     for name in columns[0]:
         table.add_row(name, *(column[name] for column in columns))
     console = Console()

@@ -44,6 +44,12 @@ def checkpoint_path(checkpoint: str | Path) -> Path:
     return found[0]
 
 
+def shipped_weights() -> Path | None:
+    """Return the package's own weights, None if it was built without."""
+    found = sorted(FOLDER.glob(f"*{SUFFIX}"))
+    return found[0] if len(found) == 1 else None
+
+
 def export_weights(checkpoint: Mapping[str, Any], source: Path, output: Path, *, dtype: str) -> None:
     """Write the network of a checkpoint to a safetensors file, without the state of training.
 
