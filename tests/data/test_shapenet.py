@@ -280,3 +280,10 @@ def test_a_cut_real_model_is_named(shared_dir: Path, tmp_path: Path) -> None:
         put_v2(tmp_path / f"{share:.2f}").write_bytes(whole[: int(share * len(whole))])
         with pytest.raises(DataError, match=r"model_normalized\.obj"):
             read_mesh(tmp_path / f"{share:.2f}", *MODEL)
+
+
+@pytest.mark.parametrize("text", ['{"min": [' + " " * 2**20 + "]}", "[" * 100_000, "{}", '{"min": [0]}'])
+def test_hostile_and_damaged_facts_are_named(tmp_path: Path, text: str) -> None:
+    put_v2(tmp_path).with_suffix(".json").write_text(text)
+    with pytest.raises(DataError, match=r"model_normalized\.json is damaged .* restore it"):
+        read_facts(tmp_path, *MODEL)

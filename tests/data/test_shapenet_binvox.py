@@ -52,3 +52,11 @@ def test_sizes_that_the_runs_do_not_fill_make_no_cells(tmp_path: Path, size: str
     path.write_bytes(header.encode() + bytes([1, 255]) * 2)
     with pytest.raises(DataError, match=r"a\.binvox is damaged \(its runs do not fill"):
         read_binvox(path)
+
+
+def test_files_of_hostile_size_are_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "a.binvox"
+    with path.open("wb") as file:  # a sparse file: it takes no room
+        file.truncate(65 * 2**20)
+    with pytest.raises(DataError, match=r"a\.binvox is damaged \(it is larger than 64 MB\)"):
+        read_binvox(path)

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from PIL import Image
 
+from raytran.data import shapenet_colors
 from raytran.data.rooms.cad import sample_model
 from raytran.data.shapenet import read_mesh
 from raytran.data.shapenet_colors import read_face_colors
@@ -60,14 +63,46 @@ def test_faces_have_the_colour_of_their_material_or_the_mean_of_its_texture(mode
         "newmtl red one\nmap_Kd ../images/missing.png\n",
         "newmtl red one\nmap_Kd ../../../../secret.png\n",
         "newmtl red one\nmap_Kd ../notes.txt\n",
+        "newmtl red one\nmap_Kd a\0b.png\n",
+        "newmtl red one\nmap_Kd ../link.png\n",
+        "newmtl red one\nmap_Kd\n",
     ],
 )
 def test_what_cannot_be_read_is_grey(model, mtl):
-    Image.new("RGB", (2, 2), "red").save(model.parents[3].parent / "secret.png")
+    secret = model.parents[3].parent / "secret.png"
+    Image.new("RGB", (2, 2), "red").save(secret)
+    (model.parents[1] / "link.png").symlink_to(secret)
     (model.parents[1] / "notes.txt").write_text("no picture")
     if mtl is not None:
         model.with_suffix(".mtl").write_text(mtl)
     np.testing.assert_allclose(colors_of(model, 5), np.round(0.7 * 255) / 255)
+
+
+def test_textures_outside_are_told_once(model, caplog):
+    paths = "newmtl a\nmap_Kd /etc/passwd\nnewmtl b\nmap_Kd ../../../../secret.png\n"
+    model.with_suffix(".mtl").write_text(paths)
+    colors_of(model, 5)
+    (said,) = caplog.messages
+    assert "model_normalized.mtl names 2 textures outside of the model's folder" in said
+    assert "(/etc/passwd): move them there" in said
+
+
+def test_a_material_file_of_hostile_size_is_not_read(model, caplog, monkeypatch):
+    monkeypatch.setattr(shapenet_colors, "_LARGEST_MTL", 2**20)
+    model.with_suffix(".mtl").write_text("newmtl red one\nKd 1 0 0\n" * 50_000)
+    np.testing.assert_allclose(colors_of(model, 5), np.round(0.7 * 255) / 255)
+    assert "larger than 1 MB and not read" in caplog.text
+
+
+def test_materials_without_faces_take_no_memory(model):
+    model.write_text("usemtl a\nusemtl b\n" * 20_000 + OBJ)
+    tracemalloc.start()
+    try:
+        found = colors_of(model, 5)
+        assert tracemalloc.get_traced_memory()[1] < 1e6
+    finally:
+        tracemalloc.stop()
+    assert len(found) == 5
 
 
 def test_another_number_of_faces_than_was_read_is_grey(model):

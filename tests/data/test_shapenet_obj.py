@@ -106,7 +106,7 @@ def test_models_beyond_any_use_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str
 ) -> None:
     monkeypatch.setattr(shapenet_obj, "_MAX_COUNT", 1000)
-    with pytest.raises(DataError, match="more than 1,000 vertices or triangles"):
+    with pytest.raises(DataError, match=r"model\.obj has more than 1,000 vertices or triangles: simplify it"):
         read_obj(put(tmp_path, TRIANGLE + ending))
 
 

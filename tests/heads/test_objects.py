@@ -83,3 +83,33 @@ def test_half_precision_keeps_centers_exact() -> None:
 def test_unknown_queries() -> None:
     with pytest.raises(ConfigError, match="learned or proposal"):
         small_head(queries="random")
+
+
+@pytest.mark.parametrize("refines", ["center", "box"])
+def test_layers_predict_the_change_of_what_is_refined(refines: str) -> None:
+    """The last layers of all predictors are set to a constant: what adds up grows from layer to layer."""
+    head = small_head(num_layers=3, refines=refines)
+    with torch.no_grad():
+        for predictor in head.predictors:
+            for network in (predictor.offset, predictor.log_size, predictor.yaw):
+                network[-1].weight.zero_()
+                network[-1].bias.fill_(0.1)
+    first, _, third = head(torch.randn(1, 4, 4, 2, 24), grid_at([0.0, 0, 0]))[0]
+    torch.testing.assert_close(third.center - first.center, torch.full((1, 6, 3), 0.2))
+    grown = 0.2 if refines == "box" else 0.0
+    torch.testing.assert_close(third.log_size - first.log_size, torch.full((1, 6, 3), grown))
+    torch.testing.assert_close(third.yaw_vector - first.yaw_vector, torch.full((1, 6, 2), grown))
+
+
+def test_refined_boxes_pass_gradients_to_early_layers() -> None:
+    reached = []
+    for refines in ("center", "box"):
+        head = small_head(refines=refines)
+        last(head, torch.randn(1, 4, 4, 2, 24), grid_at([0.0, 0, 0])).log_size.sum().backward()
+        reached.append(head.predictors[0].log_size[-1].bias.grad is not None)
+    assert reached == [False, True]
+
+
+def test_an_unknown_refinement_is_refused() -> None:
+    with pytest.raises(ConfigError, match="choose center or box"):
+        small_head(refines="all")

@@ -289,6 +289,8 @@ def test_header_row_and_empty_line(files):
         ("csv/a.csv", row(CHAIR, "c1", (0, 0, 0), (math.nan, 0, 0, 0)), r"a\.csv, line 1: qw is 'nan'"),
         ("csv/a.csv", row(CHAIR, "c1", (0, 0, 0), (0, 0, 0, 0)), r"a\.csv, line 1: .* length zero"),
         ("csv/a.csv", row(CHAIR, "c1", (0, 0, 0), scale=(1, -1, 1)), r"a\.csv, line 1: a scale"),
+        ("csv/a.csv", "x" * 200_000, r"cannot read the alignments .*a\.csv \(field larger"),
+        ("csv/a.csv", ROWS[0].replace(",", "," + "y" * 9_000, 3), r"a\.csv, line 1: .* is 'y{50}', write"),
         ("csv/a.json", scene_json("a"), r"a\.csv and .*a\.json both hold scene a"),
         ("csv/c.json", scene_json("c", box("chair", [0, 0, 0], [1, -1, 1])), r"c\.json, line 8: a size"),
         ("csv/c.json", scene_json("c", box("chair", [0, 0, math.nan], [1, 1, 1])), "line 8: a number is not"),

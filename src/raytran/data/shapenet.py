@@ -47,6 +47,9 @@ _MESHES: tuple[tuple[str, Version], ...] = (
     ("model.obj", "v1"),
     ("models/model.obj", "v1"),
 )
+_MAX_FACTS = 2**20
+"""Bytes of the largest ``.json`` that is read; ShapeNet's have less than one kilobyte."""
+
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*")
 _CATEGORY = "[0-9]" * 8
 
@@ -152,6 +155,8 @@ def read_facts(root: Path, catid: str, model_id: str) -> ModelFacts:
         return _facts_of_v1(path, read_obj(path)[0])
     path = path.with_suffix(".json")
     try:
+        if path.stat().st_size > _MAX_FACTS:
+            raise ValueError("it is larger than a megabyte")
         values = json.loads(path.read_text(encoding="utf-8"))
         low, high, centroid = (np.array(values[key], dtype=np.float64) for key in ("min", "max", "centroid"))
         if {low.shape, high.shape, centroid.shape} != {(3,)}:
@@ -159,7 +164,7 @@ def read_facts(root: Path, catid: str, model_id: str) -> ModelFacts:
         return ModelFacts(int(values["numVertices"]), low, high, centroid)
     except OSError as error:
         raise DataError(f"cannot read {path}: {error.strerror}; restore the file") from error
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise DataError(f"the file {path} is damaged ({error}); restore it") from error
 
 

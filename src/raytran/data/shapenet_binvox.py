@@ -10,8 +10,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from raytran.errors import DataError
 
-_MAX_SIZE = 1024
+_MAX_SIZE = 512
 """Most cells along a side that are read; ShapeNet has 128."""
+
+_MAX_BYTES = 64 * 2**20
+"""Largest file that is read; ShapeNet's have less than one megabyte."""
 
 
 def read_binvox(path: Path) -> tuple[NDArray[np.bool_], NDArray[np.float64], float]:
@@ -25,6 +28,8 @@ def read_binvox(path: Path) -> tuple[NDArray[np.bool_], NDArray[np.float64], flo
         DataError: the file is missing or damaged.
     """
     try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise ValueError(f"it is larger than {_MAX_BYTES / 2**20:.0f} MB")
         header, body = path.read_bytes().split(b"data\n", 1)
         fields = {
             words[0]: words[1:] for line in header.decode("ascii").splitlines() if (words := line.split())

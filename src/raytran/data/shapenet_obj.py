@@ -101,7 +101,10 @@ def _parse(path: Path, vertices: array[float], corners: array[int]) -> str:
         elif kind == b"#" and (match := _ANNOUNCED.match(line)):
             expected[match[2]] += int(match[1])
         if max(len(vertices), len(corners)) > 3 * _MAX_COUNT:
-            raise ValueError(f"it has more than {_MAX_COUNT:,} vertices or triangles")
+            raise DataError(
+                f"the CAD model {path} has more than {_MAX_COUNT:,} vertices or triangles: simplify it or "
+                "leave it out"
+            )
     found = {b"vertex positions": len(vertices) // 3, b"faces": elements}
     lacking = [
         f"{found[kind]:,} of {number:,} {kind.decode()}"

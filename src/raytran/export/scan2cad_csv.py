@@ -112,10 +112,10 @@ def _read_rows(path: Path, columns: tuple[str, ...], n_names: int) -> list[_Row]
     rows: list[_Row] = []
     not_unit: list[int] = []
     try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        table = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise DataError(f"cannot read the alignments {path} ({error}): check the path") from error
-    for line, cells in enumerate(csv.reader(lines), start=1):
+    for line, cells in enumerate(table, start=1):
         cells = [cell.strip() for cell in cells]
         if not any(cells):
             continue
@@ -156,7 +156,7 @@ def _parses(parse: Callable[[str], float], cell: str) -> bool:
 def _numbers(cells: list[str], columns: tuple[str, ...], path: Path, line: int) -> list[float]:
     for name, cell in zip(columns, cells, strict=True):
         if not _parses(float, cell) or not math.isfinite(float(cell)):
-            raise DataError(f"{path}, line {line}: {name} is {cell!r}, write a finite number")
+            raise DataError(f"{path}, line {line}: {name} is {cell[:50]!r}, write a finite number")
     return [float(cell) for cell in cells]
 
 

@@ -34,10 +34,12 @@ class ObjectHead(nn.Module):
         hidden: channels inside the decoder's feed-forward.
         windowed: attend to the voxels through a learned window around the reference point, which learns from
             few scenes; False attends to all voxels alike, as in DETR and the paper.
+        refines: what a layer hands on to the next, which predicts the difference: ``"center"``, or ``"box"``,
+            size and yaw too (iterative box refinement in Deformable DETR).
         grid_extent: sizes of the voxel grid, metres.
 
     Raises:
-        ConfigError: ``queries`` is unknown.
+        ConfigError: ``queries`` or ``refines`` is unknown.
     """
 
     extent: Tensor
@@ -52,11 +54,15 @@ class ObjectHead(nn.Module):
         queries: Literal["learned", "proposal"] = "learned",
         hidden: int = 1024,
         windowed: bool = False,
+        refines: Literal["center", "box"] = "center",
         grid_extent: Sequence[float] = (9.0, 9.0, 3.5),
     ) -> None:
         super().__init__()
         if queries not in ("learned", "proposal"):
             raise ConfigError(f"unknown queries={queries}: choose learned or proposal")
+        if refines not in ("center", "box"):
+            raise ConfigError(f"unknown refines={refines}: choose center or box")
+        self.refines = refines
         self.grid_extent = tuple(float(length) for length in grid_extent)
         self.register_buffer("extent", torch.tensor(self.grid_extent), persistent=False)
         self.queries: nn.Module = (
@@ -83,12 +89,14 @@ class ObjectHead(nn.Module):
         voxel_position = at_origin.voxel_centers().flatten(0, 2)
         memory = voxels.flatten(1, 3) + self._locate(voxel_position)
         start: Queries = self.queries(voxels, grid)
-        embedding, reference = start.embedding, start.reference
+        embedding, box = start.embedding, start
         outputs = []
         for layer, predictor in zip(self.layers, self.predictors, strict=True):
-            embedding = layer(embedding, self._locate(reference), reference, memory, voxel_position)
-            objects = predictor(embedding, start._replace(reference=reference), grid_center)
-            reference = objects.center - grid_center[:, None]
+            embedding = layer(embedding, self._locate(box.reference), box.reference, memory, voxel_position)
+            objects = predictor(embedding, box, grid_center)
+            box = box._replace(reference=objects.center - grid_center[:, None])
+            if self.refines == "box":
+                box = box._replace(log_size=objects.log_size, yaw_vector=objects.yaw_vector)
             outputs.append(objects)
         return tuple(outputs), start.proposals
 

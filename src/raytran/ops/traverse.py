@@ -29,6 +29,9 @@ NUDGE = 1e-9
 _PARALLEL = 1e-12
 """Slopes below this, in voxels per metre of depth, count as zero."""
 
+_VIEWS_AT_ONCE = 8
+"""Views that are counted together."""
+
 _AT_ONCE = {"cpu": 1 << 18}
 _AT_ONCE_ELSEWHERE = 1 << 23
 """Crossings looked at together: on a CPU so few that they stay in its cache."""
@@ -104,7 +107,7 @@ def count_views(
     """Return how many views have a ray through each voxel, ``(X, Y, Z)`` int32.
 
     Args:
-        cameras: the cameras of one scene, ``(N,)``; they are traced one by one, so that memory does not grow.
+        cameras: the cameras of one scene, ``(N,)``; a few are traced at a time, so that memory does not grow.
         grid: its voxel grid, ``center`` ``(3,)``.
         feature_size: as in ``trace_pairs``.
         rays_per_cell: as in ``trace_pairs``.
@@ -114,9 +117,13 @@ def count_views(
     """
     check_shape(cameras.intrinsics, "N 3 3", "intrinsics")
     counts = torch.zeros(grid.num_voxels, dtype=torch.int32, device=cameras.intrinsics.device)
-    for intrinsics, pose in zip(cameras.intrinsics.split(1), cameras.world_from_camera.split(1), strict=True):
-        one = Cameras(intrinsics, pose, cameras.image_size)
-        counts[trace_pairs(one, grid, feature_size, rays_per_cell).voxel_index.unique()] += 1
+    some = (tensor.split(_VIEWS_AT_ONCE) for tensor in (cameras.intrinsics, cameras.world_from_camera))
+    for intrinsics, pose in zip(*some, strict=True):
+        pairs = trace_pairs(Cameras(intrinsics, pose, cameras.image_size), grid, feature_size, rays_per_cell)
+        view = pairs.pixel_index.div(feature_size[0] * feature_size[1], rounding_mode="floor")
+        met = torch.zeros(len(pose), grid.num_voxels, dtype=torch.bool, device=counts.device)
+        met[view, pairs.voxel_index] = True
+        counts += met.sum(dim=0, dtype=torch.int32)
     return counts.view(grid.resolution)
 
 

@@ -173,6 +173,19 @@ def test_a_mesh_of_too_many_triangles_is_left_out(library, tmp_path, monkeypatch
     assert "36 triangles" in import_furniture(library, tmp_path, **QUIET).left_out["Scopia#chair"]
 
 
+def test_a_mesh_of_hostile_size_is_not_parsed(tmp_path, write_library, entry, monkeypatch):
+    monkeypatch.setattr("raytran.data.cads.mesh.trimesh.load_scene", None)
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 1\n" + "f 1 2 3\n" * 300_000
+    for number, obj in enumerate((corners, corners[:24] + "f" + " 1 2 3" * 300_000)):
+        path = write_library(
+            tmp_path / f"{number}.sh3f",
+            entry(1, "Scopia#chair", model="/scopia/odd.obj"),
+            **{"scopia/odd.obj": obj},
+        )
+        report = import_furniture(path, tmp_path / f"out{number}", **QUIET)
+        assert "has faces of 900,000 corners" in report.left_out["Scopia#chair"]
+
+
 @pytest.mark.parametrize("mtllib", ["none.mtl", "../../../../etc/passwd", "LICENSE.TXT"])
 def test_materials_that_are_not_there_are_grey(mtllib, tmp_path, write_library, entry):
     files = {

@@ -22,6 +22,9 @@ logging.getLogger("trimesh").setLevel(logging.WARNING)
 MOST_FACES = 100_000
 """Models with more triangles are left out: a room of them would take minutes to draw."""
 
+_MOST_CORNERS = 6 * MOST_FACES
+"""Models whose text has more corners of faces are not parsed, which takes ten times their size in memory."""
+
 _LARGEST_TEXTURE = 64 * 10**6
 _GREY = np.full(3, 0.7)
 _TEXTURE_SIDE = 256
@@ -56,6 +59,11 @@ def read_piece(library: FurnitureLibrary, piece: Piece, turn_deg: float = 0.0) -
         DataError: the model is missing, damaged, empty, flat or has more than ``MOST_FACES`` triangles.
     """
     data = library.read(piece.model)
+    corners = _corners(data)
+    if corners > _MOST_CORNERS:
+        raise DataError(
+            f"{piece.model} in {library.path} has faces of {corners:,} corners: it is no furniture"
+        )
     try:
         resolver = library.files_beside(piece.model)
         scene = trimesh.load_scene(io.BytesIO(data), file_type="obj", resolver=resolver)
@@ -75,6 +83,11 @@ def read_piece(library: FurnitureLibrary, piece: Piece, turn_deg: float = 0.0) -
     solid = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     group = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
     return PieceMesh(vertices, faces[solid], group[solid], np.array([_color(part) for part in parts]))
+
+
+def _corners(obj: bytes) -> int:
+    """Return about how many corners the faces of an OBJ file have, without parsing it."""
+    return sum(line.count(b" ") + line.count(b"\t") for line in io.BytesIO(obj) if line.startswith(b"f"))
 
 
 def _placed(triangles: NDArray[np.float64], piece: Piece, turn_deg: float) -> NDArray[np.float64]:
