@@ -162,14 +162,15 @@ def _is_of(name: str, experiment: Path) -> bool:
 
 
 def _presets_table(_: str) -> list[str]:
-    names = ("raytran", "small", "tiny")
+    names = ("raytran", "small", "laptop", "tiny")
     columns = {name: {o.name: o for o in options(f"preset/{name}")} for name in names}
-    rows = ["| setting | " + " | ".join(f"`preset={name}`" for name in names) + " | |", "|---" * 5 + "|"]
+    rows = ["| setting | " + " | ".join(f"`preset={name}`" for name in names) + " | |"]
+    rows.append("|---" * (len(names) + 2) + "|")
     for option in columns[names[0]].values():
         if option.name in ("", "preset"):
             continue
         if option.value is None:
-            rows.append(f"| **`{option.name}.…` {_cell(option.comment)}** | | | | |")
+            rows.append(f"| **`{option.name}.…` {_cell(option.comment)}** |" + " |" * (len(names) + 1))
             continue
         values = [_code(columns[name][option.name].value or "") for name in names]
         rows.append(f"| `{option.name}` | {' | '.join(values)} | {_cell(option.comment)} |")

@@ -18,7 +18,7 @@ from raytran.run.entry import compose
 from raytran.run.settings import RunConfig
 
 EXPERIMENTS = ("stage1", "stage2", "stage3")
-PRESETS = ("raytran", "small", "tiny")
+PRESETS = ("raytran", "small", "laptop", "tiny")
 TRAINERS = ("auto", "cpu", "gpu", "ddp", "ddp_cpu")
 # Given by the code that instantiates the node, not by the config.
 GIVEN_BY_CODE = {
@@ -150,7 +150,7 @@ def test_every_experiment_resolves_with_every_preset(preset, experiment):
     OmegaConf.resolve(config)
     assert (config.preset, config.experiment) == (preset, experiment)
     assert config.trainer.max_steps == config.schedule[config.stage.name].steps
-    assert all(side % 16 == 0 for side in config.views.image_size)
+    assert all(side % config.model.backbone.resnet.stride == 0 for side in config.views.image_size)
 
 
 @pytest.mark.parametrize("preset", ["small", "tiny"])

@@ -42,8 +42,10 @@ def name(path: Path) -> str:
 
 
 def chosen(path: Path, *more: str):
-    """Compose the training config with the choice that ``path`` is."""
-    return compose("train", ["preset=tiny", f"{path.parent}={path.name}", "output_dir=x", *more])
+    """Compose the training config with the choice that ``path`` is, in a preset that it fits."""
+    presets = [preset.name for preset in files("preset") if path.name.endswith(preset.name)]
+    preset = presets[0] if presets else "tiny"
+    return compose("train", [f"preset={preset}", f"{path.parent}={path.name}", "output_dir=x", *more])
 
 
 def whole_config(*overrides: str):
