@@ -9,11 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hydra.utils import instantiate
 from PIL import Image
 
 from raytran.errors import ConfigError, DataError
+from raytran.run.build import build_model
 from raytran.run.ceilings import Ceilings, measure_ceilings
 from raytran.run.entry import compose
+from raytran.run.forecast import Load, training_bytes
 from raytran.run.plan import GIBIBYTE, Need, advice, parse_size, plan
 
 FAST = ["preset=tiny", "ceilings=[1,10]"]
@@ -143,3 +146,15 @@ def test_the_forecast_is_within_a_factor_of_two_of_the_measured_peak() -> None:
     done = subprocess.run([sys.executable, "-c", MEASURED], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert 0.5 < float(done.stdout.split()[-1]) < 2.0
+
+
+def test_views_to_be_rendered_need_memory_in_training() -> None:
+    cfg = compose("plan", [*FAST, "stage=view"])
+    del cfg.model.grid
+    model, load = build_model(cfg, pretrained=False), Load(1, 3, (96, 128), 20.0, fused=False)
+    few, many = (
+        training_bytes(model, load, instantiate(cfg.stage, new_views=count, _convert_="all"))
+        for count in (1, 17)
+    )
+    # Of 16 more views at least their images and the widest layer of the head at full and at half size.
+    assert many - few > 16 * 96 * 128 * 4 * (3 + 8 / 4)

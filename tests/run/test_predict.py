@@ -108,6 +108,8 @@ def config(folder, output, **changes) -> DictConfig:
         "views": None,
         "turntable": 2,
         "cads": None,
+        "viewer": True,
+        "truth": None,
         "views_at_once": 4,
         "device": "cpu",
     }
@@ -130,9 +132,34 @@ def test_all_files_are_written(scene, oracle, tmp_path):
         "meshes",
         "topdown.png",
         "overlays",
+        "view",
     }
     assert len(list((output / "overlays").iterdir())) == 2
     assert [path.name for path in output.parent.iterdir()] == ["room"]
+
+
+def test_the_viewer_gets_frames_voxels_and_errors(scene, oracle, tmp_path):
+    truth = tmp_path / "truth.json"
+    chair = {
+        "category": "chair",
+        "score": 1.0,
+        "center": [0.5, 3.1, 0.5],
+        "size": [0.5, 1.0, 0.6],
+        "mesh": None,
+    }
+    chair["rotation"] = UPRIGHT.tolist()
+    truth.write_text(json.dumps({"format": "raytran.scene/1", "scene_id": "any", "objects": [chair]}))
+    output = module.predict(config(scene, tmp_path / "out", truth=str(truth)))
+    content = json.loads((output / "view" / "view.json").read_text())
+    assert [frame["name"] for frame in content["frames"]] == ["0", "5", "15", "20"]
+    assert content["volumes"][0]["resolution"] == [4, 4, 2]
+    assert content["errors"][0]["found"]
+    assert content["errors"][0]["translation_m"] == pytest.approx(0.1, abs=1e-6)
+    output = module.predict(config(scene, tmp_path / "out", viewer=False))
+    assert not (output / "view").exists()
+    with pytest.raises(DataError, match=r"cannot read truth=.*nothing\.json"):
+        module.predict(config(scene, tmp_path / "none", truth=str(tmp_path / "nothing.json")))
+    assert not (tmp_path / "none").exists()
 
 
 def test_views_follow_the_checkpoint_and_come_once(scene, oracle, tmp_path):

@@ -68,7 +68,7 @@ def write_view_data(
         prediction: its objects in the order of ``scene.json``.
         views: B = 1, all frames.
         frame_ids: name of each frame.
-        volumes: at least one.
+        volumes: none if the network has no voxels.
         truth: the annotated objects, or None if they are not known.
 
     Returns:

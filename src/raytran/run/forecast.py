@@ -5,14 +5,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
+from raytran.geometry.camera import Cameras
 from raytran.losses.foreground import foreground_loss
 from raytran.losses.occupancy import occupancy_loss
+from raytran.losses.view import view_loss
 from raytran.model import SHAPES_AT_ONCE, RayTran
 from raytran.ops.pairs import PairList
 from raytran.run.count import Work, count_part
@@ -73,9 +75,11 @@ def training_bytes(model: RayTran, load: Load, stage: Stage, *, precision: str =
         trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
         moments = [torch.empty_like(parameter) for parameter in trained for _ in range(2)]
         views = load.fake_views(network.backbone.resnet.input_channels)
+        new_views = replace(load, views=stage.new_views).fake_views(3)
         with stand_ins(load.pairs_per_pixel, fused=load.fused):
             with _precision(precision):
-                loss = _loss(network, network(views, tasks=stage.tasks), stage)
+                raw = network(views, tasks=stage.tasks, new_cameras=Cameras.of(new_views))
+                loss = _loss(network, raw, stage, new_views)
             loss.backward()
         del moments
 
@@ -136,7 +140,7 @@ def _precision(name: str) -> Iterator[None]:
         yield
 
 
-def _loss(network: RayTran, raw: RawScene, stage: Stage) -> Tensor:
+def _loss(network: RayTran, raw: RawScene, stage: Stage, new_views: Views) -> Tensor:
     """Return a scalar that depends on what the stage's loss depends on, through the same tensors."""
     terms: list[Tensor] = []
     dense: dict[str, tuple[Tensor | None, Callable[[Tensor, Tensor], Tensor]]] = {
@@ -146,6 +150,8 @@ def _loss(network: RayTran, raw: RawScene, stage: Stage) -> Tensor:
     for logits, function in (dense[name] for name in stage.terms if name in dense):
         if logits is not None:
             terms.append(function(logits, torch.empty(logits.shape, dtype=torch.bool)))
+    if "view" in stage.terms and raw.new_views is not None:
+        terms.append(view_loss(raw.new_views, new_views))
     for layer in (raw.objects or ()) if "objects" in stage.terms else ():
         terms += [x.sum() for x in (layer.class_logits, layer.center, layer.log_size, layer.yaw_vector)]
     if "shape" in stage.terms and raw.objects is not None:

@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 import logging
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Unpack
 
 from omegaconf import DictConfig
 
+from raytran.backbone.observed import observe_attention
 from raytran.data.importers.open import open_scene
 from raytran.data.importers.orient import WorldSettings
 from raytran.data.shapenet import shapenet_version
@@ -20,6 +22,7 @@ from raytran.run.device import choose_device
 from raytran.run.output import check_replaceable
 from raytran.run.render_views import cameras_to_render, render_views
 from raytran.run.scene_files import MARKER, PredictedScene, write_scene
+from raytran.run.viewed import read_truth, viewed_volumes
 from raytran.run.volumes import Limits, RoomViews, check_choice, predict_room, predict_volume, read_room
 from raytran.types import Views
 
@@ -59,18 +62,10 @@ def predict(cfg: DictConfig) -> Path:
     model = load_model(cfg.checkpoint).to(choose_device(cfg.device))
     _check_channels(model, cfg.checkpoint)
     new_cameras = cameras_to_render(cfg.views, model, cfg.checkpoint)
+    scene_id = scene.stem if scene.is_file() else scene.name
+    truth = read_truth(Path(cfg.truth), scene_id) if cfg.truth else None
     room = _read(cfg, world, settings, model)
-    prediction = predict_room(
-        model,
-        room,
-        scene_id=scene.stem if scene.is_file() else scene.name,
-        score_threshold=cfg.score_threshold,
-        duplicate_iou=cfg.duplicate_iou,
-        views_at_once=cfg.views_at_once,
-    )
-    found = PredictedScene(prediction, object_meshes(prediction))
-    if cfg.cads:
-        found = found.with_cads(Path(cfg.cads))
+    found = _find(cfg, model, room, scene_id)
     write_scene(
         output,
         found,
@@ -79,6 +74,7 @@ def predict(cfg: DictConfig) -> Path:
         grid_extent=room.volumes.joint().extent,
         num_overlays=cfg.num_overlays,
         turntable=cfg.turntable,
+        truth=truth,
     )
     if new_cameras is not None:
         render_views(model, room, new_cameras, output, views_at_once=cfg.views_at_once)
@@ -87,7 +83,7 @@ def predict(cfg: DictConfig) -> Path:
 
 
 def predict_scene(model: RayTran, views: Views, **limits: Unpack[Limits]) -> PredictedScene:
-    """Run the network on the views of one scene, in one volume, and make meshes of the objects it found.
+    """Run the network on the views of one scene, in one volume, and make all that ``write_scene`` writes.
 
     Args:
         model: the network, on any device.
@@ -97,8 +93,31 @@ def predict_scene(model: RayTran, views: Views, **limits: Unpack[Limits]) -> Pre
     Returns:
         The result, on the CPU.
     """
-    prediction = predict_volume(model, views, **limits)
-    return PredictedScene(prediction, object_meshes(prediction))
+    with observe_attention(model) as observed:
+        prediction = predict_volume(model, views, **limits)
+    volumes = viewed_volumes(model, views, prediction, observed, grid_extent=model.grid_extent)
+    return PredictedScene(prediction, object_meshes(prediction), volumes=volumes)
+
+
+def _find(cfg: DictConfig, model: RayTran, room: RoomViews, scene_id: str) -> PredictedScene:
+    """Return the objects of a scene with what is made of them, and for the viewer how the network read it."""
+    with observe_attention(model) if cfg.viewer else nullcontext() as observed:
+        prediction = predict_room(
+            model,
+            room,
+            scene_id=scene_id,
+            score_threshold=cfg.score_threshold,
+            duplicate_iou=cfg.duplicate_iou,
+            views_at_once=cfg.views_at_once,
+        )
+    volumes = None
+    if cfg.viewer:
+        several = len(room.members) > 1
+        parts = tuple(zip(room.volumes.center, room.members, strict=True)) if several else ()
+        extent = room.volumes.joint().extent
+        volumes = viewed_volumes(model, room.views, prediction, observed, grid_extent=extent, parts=parts)
+    found = PredictedScene(prediction, object_meshes(prediction), volumes=volumes)
+    return found.with_cads(Path(cfg.cads)) if cfg.cads else found
 
 
 def _read(cfg: DictConfig, world: WorldSettings, settings: PredictionSettings, model: RayTran) -> RoomViews:

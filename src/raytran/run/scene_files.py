@@ -13,6 +13,7 @@ from raytran.export import write_prediction
 from raytran.export.glb import write_glb
 from raytran.export.nearest_cad import NearestCads, nearest_cads
 from raytran.export.scan2cad_csv import ALIGNMENTS, write_alignments_csv
+from raytran.export.view_data import ViewedVolume, write_view_data
 from raytran.geometry.camera import Cameras
 from raytran.run.output import replaced_folder
 from raytran.types import ObjectSet, ScenePrediction, Views
@@ -32,11 +33,13 @@ class PredictedScene:
         prediction: its ``M`` objects.
         meshes: of each object, in the world; None: empty shape.
         cads: the CAD model of each object; None: not asked for.
+        volumes: the voxels for the viewer; None: nothing is written for it.
     """
 
     prediction: ScenePrediction
     meshes: Sequence[trimesh.Trimesh | None]
     cads: NearestCads | None = None
+    volumes: Sequence[ViewedVolume] | None = None
 
     def with_cads(self, root: Path) -> PredictedScene:
         """Return the scene with the CAD models of a library that its objects are most like.
@@ -69,7 +72,7 @@ def write_scene(
         grid_extent: sizes of the voxel grid, metres.
         num_overlays: frames to draw over.
         turntable: pictures of the turn in ``turntable.gif``; 0: there is none.
-        truth: annotated objects to draw in the plan, or None.
+        truth: annotated objects to draw in the plan and to compare with, or None.
 
     Raises:
         ConfigError: ``output`` holds something that is no earlier result.
@@ -92,6 +95,8 @@ def write_scene(
         if found.cads is not None:
             write_alignments_csv(folder / ALIGNMENTS, found.cads.alignments())
             write_glb(folder / "cads.glb", prediction.objects, found.cads.meshes())
+        if found.volumes is not None:
+            write_view_data(folder, prediction, views, frame_ids, volumes=found.volumes, truth=truth)
         write_prediction(
             folder, prediction, found.meshes, cameras=cameras, frame_ids=frame_ids, grid_extent=grid_extent
         )

@@ -5,17 +5,14 @@ import { flatIndex, ownerOf, readScene, readsOf, voxelAt, voxelCenter } from "./
 import { FramePanel } from "./frame.js";
 import { Objects } from "./objects.js";
 import { World } from "./world.js";
-import { hasWebGL } from "./webgl.js";
 import { Vector3 } from "./vendor/three.js";
 
 const element = (id) => document.getElementById(id);
 const LAYERS = ["meshes", "boxes", "labels", "cameras", "truth", "voxels"];
 const state = { data: null, frame: 0, object: null, reads: null, volume: null };
 
-if (!hasWebGL()) {
-  say("This browser cannot draw in three dimensions: it needs WebGL 2 (see chrome://gpu or about:support).", true);
-  throw new Error("no WebGL 2");
-}
+globalThis.addEventListener("error", ({ message }) => say(message, true));
+
 const world = new World(element("canvas"), element("labels"), (hit, wantsVoxel) => {
   if (wantsVoxel) return selectVoxel(hit?.point);
   if (!hit) return selectObject(null);
@@ -220,5 +217,5 @@ document.addEventListener("keydown", (event) => {
 const names = await (await fetch("scenes.json")).json();
 element("scenes-label").hidden = names.length < 2;
 element("scenes").replaceChildren(...names.map((name, number) => new Option(name, String(number))));
-globalThis.raytran = { world, state };
+globalThis.raytran = { world, state, open };
 await open(0);

@@ -47,7 +47,8 @@ export class Objects {
 
 function describe(object, withErrors) {
   const metres = (values) => values.map((value) => value.toFixed(2)).join(" × ");
-  const views = object.num_views === undefined ? "" : `, seen by ${Math.round(object.num_views)} views`;
+  const sure = object.confidence === undefined ? "" : `, confidence ${object.confidence.toFixed(2)}`;
+  const views = object.num_views === undefined ? "" : `, seen by ${Math.round(object.num_views)} views${sure}`;
   const cad = object.id_cad ? `, CAD ${object.catid_cad}/${object.id_cad}` : "";
   const text = `${metres(object.size)} m (width × height × depth) at (${object.center.map((v) => v.toFixed(2)).join(", ")})${views}${cad}.`;
   if (!withErrors) return text;

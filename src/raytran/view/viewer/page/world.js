@@ -10,7 +10,7 @@ import { readMeshes } from "./meshes.js";
 import { intersections } from "./picking.js";
 import { boxBars, cameraCubes, frustumLines, highest, outline, picturePlane, positionOf, segments } from "./shapes.js";
 import { Voxels } from "./voxels.js";
-import { drawsInSoftware } from "./webgl.js";
+import { contextOf } from "./webgl.js";
 
 const IMAGE_DEPTH = 0.4;
 const BACKDROP_DEPTH = 15;
@@ -25,7 +25,7 @@ export class World {
     this.canvas = canvas;
     this.labels = labels;
     this.onPick = onPick;
-    this.renderer = new WebGLRenderer({ canvas, antialias: !drawsInSoftware() });
+    this.renderer = new WebGLRenderer({ canvas, context: contextOf(canvas) });
     this.camera = new PerspectiveCamera(50, 1, 0.02, 500);
     this.camera.up.set(0, 0, 1);
     this.controls = new OrbitControls(this.camera, canvas);
@@ -213,6 +213,7 @@ export class World {
 
   /** Where a point of the world is on the canvas, CSS pixels, or null behind the camera. */
   project(point) {
+    this.camera.updateMatrixWorld();
     const at = new Vector3(...point).project(this.camera);
     if (at.z > 1 || at.z < -1) return null;
     return [((at.x + 1) / 2) * this.canvas.clientWidth, ((1 - at.y) / 2) * this.canvas.clientHeight];
