@@ -44,7 +44,18 @@ def test_the_wheel_is_what_runs(site: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "command",
-    ["train", "curriculum", "evaluate", "predict", "prepare", "demo", "replay", "report", "export_model"],
+    [
+        "train",
+        "curriculum",
+        "evaluate",
+        "predict",
+        "prepare",
+        "demo",
+        "replay",
+        "report",
+        "export_model",
+        "view",
+    ],
 )
 def test_commands_find_their_configs(site: Path, tmp_path: Path, command: str) -> None:
     shown = run(site, tmp_path, "-m", f"raytran.{command}", "--cfg", "job")
@@ -71,6 +82,13 @@ def test_rooms_are_made_where_the_user_is(site: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["report.html.j2", "runs.html.j2", "doctor.html.j2", "page.css"])
 def test_the_page_templates_are_inside(name: str, site: Path) -> None:
     assert (site / "raytran" / "view" / "templates" / name).is_file()
+
+
+def test_the_viewers_page_is_inside(site: Path, project_root: Path) -> None:
+    page = Path("raytran") / "view" / "viewer" / "page"
+    expected = {path.relative_to(project_root / "src") for path in (project_root / "src" / page).rglob("*.*")}
+    assert page / "vendor" / "three.js.gz" in expected
+    assert {path.relative_to(site) for path in (site / page).rglob("*.*")} == expected
 
 
 def test_the_folder_of_weights_is_inside(site: Path, project_root: Path) -> None:
