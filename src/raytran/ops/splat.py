@@ -3,11 +3,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from raytran.errors import check_shape
 from raytran.ops.block_pairs import BlockPairs
@@ -46,26 +46,40 @@ def splat_features(features: Tensor, pairs: PairList | BlockPairs) -> tuple[Tens
     pairs = listed(pairs)
     by_voxel, by_pixel = pairs.by("voxels"), pairs.by("pixels")
     with torch.autocast(features.device.type, enabled=False):
-        mean = _Splat.apply(features.to(dtype), by_voxel, by_pixel)
+        mean = _mean(features.to(dtype), list(by_voxel), list(by_pixel))
     return mean.to(features.dtype), by_voxel.row_offsets.diff() > 0
 
 
-class _Splat(torch.autograd.Function):
-    """Sum and divide; backward, divide and sum along the other side's rows."""
+@torch.library.custom_op("raytran::pair_mean", mutates_args=())
+def _mean(features: Tensor, by_voxel: Sequence[Tensor], by_pixel: Sequence[Tensor]) -> Tensor:
+    """Return the mean ``(num_voxels, C)`` of ``features`` over the pairs of each voxel.
 
-    @staticmethod
-    def forward(ctx: Any, features: Tensor, by_voxel: PairOrder, by_pixel: PairOrder) -> Tensor:
-        ctx.save_for_backward(*by_voxel, *by_pixel)
-        ones = features.new_ones(by_voxel.col_index.shape)
-        return sparse_product(ones, features, by_voxel) / _counts(by_voxel, features)
+    Orders are ``PairOrder``'s tensors; that of the pixels serves the backward pass.
+    """
+    order = PairOrder(*by_voxel)
+    ones = features.new_ones(order.col_index.shape)
+    return sparse_product(ones, features, order) / _counts(order, features)
 
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        by_voxel, by_pixel = PairOrder(*ctx.saved_tensors[:3]), PairOrder(*ctx.saved_tensors[3:])
-        with torch.autocast(grad.device.type, enabled=False):
-            ones = grad.new_ones(by_pixel.col_index.shape)
-            return sparse_product(ones, grad / _counts(by_voxel, grad), by_pixel), None, None
+
+@_mean.register_fake
+def _(features: Tensor, by_voxel: Sequence[Tensor], by_pixel: Sequence[Tensor]) -> Tensor:
+    return features.new_empty(by_voxel[0].shape[0] - 1, features.shape[1])
+
+
+def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    _, by_voxel, by_pixel = inputs
+    ctx.save_for_backward(*by_voxel, *by_pixel)
+
+
+def _gradient(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
+    by_voxel, by_pixel = PairOrder(*ctx.saved_tensors[:3]), PairOrder(*ctx.saved_tensors[3:])
+    ones = grad.new_ones(by_pixel.col_index.shape)
+    with torch.autocast(grad.device.type, enabled=False):
+        back = sparse_product(ones, grad / _counts(by_voxel, grad), by_pixel)
+    return back, [None] * 3, [None] * 3
+
+
+_mean.register_autograd(_gradient, setup_context=_keep)
 
 
 def _counts(order: PairOrder, like: Tensor) -> Tensor:
