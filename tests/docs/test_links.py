@@ -43,3 +43,15 @@ def test_the_check_finds_what_is_wrong():
     page = "# Top\n[a](x.md) `[b](y.md)` [c](https://z.org)\n```\n[d](w.md)\n```\n## Its `code`, too!\n"
     assert links(page) == ["x.md"]
     assert anchors(page) == {"top", "its-code-too"}
+
+
+def test_every_page_is_found_from_the_first(pages, project_root):
+    seen, to_read = set(), [project_root / "docs" / "README.md"]
+    while to_read:
+        page = to_read.pop()
+        if page in seen or page not in pages:
+            continue
+        seen.add(page)
+        to_read += [(page.parent / unquote(link).partition("#")[0]).resolve() for link in links(pages[page])]
+    lost = [page for page in pages if page not in seen and page.is_relative_to(project_root / "docs")]
+    assert not lost, f"docs/README.md leads to no link to {', '.join(path.name for path in lost)}"

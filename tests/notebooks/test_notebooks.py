@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[2]
 NAMES = sorted(path.name for path in (ROOT / "notebooks").glob("*.ipynb"))
 FIRST = "01_first_scene.ipynb"
 WEIGHTS = sorted((Path(raytran.__file__).parent / "weights").glob("*.safetensors"))
-MAX_BYTES = 300_000
+MAX_BYTES = 200_000
 
 
 @pytest.fixture(scope="module")
