@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import pytest
 import torch
@@ -11,6 +12,8 @@ from safetensors import safe_open
 
 import raytran
 from raytran.errors import CheckpointError, ConfigError
+from raytran.export.program import example_inputs
+from raytran.run.camera_paths import walk
 from raytran.run.checkpoint import prediction_settings
 from raytran.run.entry import compose
 from raytran.run.export_model import export_model
@@ -82,7 +85,13 @@ def test_an_exported_file_is_exported_again(trained, tmp_path):
     ("settings", "error", "message"),
     [
         (["dtype=int8"], ConfigError, "unknown dtype=int8: choose one of float32, float16, bfloat16"),
-        (["output=weights.onnx"], ConfigError, r"weights\.onnx has an unknown ending: choose \.safetensors"),
+        (["output=weights.onnx"], ConfigError, r"weights\.onnx has an unknown ending: choose .* or \.pt2"),
+        (["output=a.pt2", "dtype=float16"], ConfigError, r"dtype=float16 is for \.safetensors"),
+        (
+            ["output=a.pt2", "program.part=heads"],
+            ConfigError,
+            "unknown program.part=heads: choose one of network",
+        ),
         (["checkpoint=none.ckpt"], CheckpointError, r"no checkpoint at none\.ckpt"),
     ],
 )
@@ -147,3 +156,30 @@ def test_without_output_it_says_what_is_inside(trained, capsys):
     words = capsys.readouterr().out
     for said in ("stage joint, 3 steps", "M, float32", "val/objects/f1_0.25", "0.5", torch.__version__):
         assert said in words, said
+
+
+def test_a_program_says_how_to_use_it(trained, tmp_path, caplog):
+    caplog.set_level("INFO")
+    words = [f"checkpoint={trained.path}", f"output={tmp_path / 'rooms.pt2'}", "program.tasks=occupancy"]
+    path = export_model(compose("export_model", words))
+    extra = {"raytran.json": ""}
+    program = torch.export.load(path, extra_files=extra).module()
+    about = json.loads(extra["raytran.json"])
+    assert (about["format"], about["operators"], about["stage"]) == ("raytran.program/1", "aten", "shape")
+    size = prediction_settings(trained.path).image_size
+    assert tuple(about["image_size"]) == size
+    inputs = example_inputs(trained.model, walk(2).scaled_to(size))
+    assert about["feature_size"] == [side // trained.model.backbone.stride for side in size]
+    with torch.no_grad():
+        assert program(*inputs)["occupancy"].shape == tuple(about["grid_resolution"])
+    assert float(re.search(r"differ from the network's by at most (\S+)", caplog.text)[1]) < 1e-4
+    with pytest.raises(CheckpointError, match=r"rooms\.pt2 is a program of torch\.export.*\.safetensors"):
+        raytran.load(path)
+
+
+def test_the_decoder_of_shapes_is_a_program_too(trained, tmp_path):
+    words = [f"checkpoint={trained.path}", f"output={tmp_path / 'shapes.pt2'}", "program.part=shapes"]
+    program = torch.export.load(export_model(compose("export_model", words))).module()
+    embedding = torch.randn(1, trained.model.backbone.channels)
+    with torch.no_grad():
+        torch.testing.assert_close(program(embedding), trained.model.eval().decode_shapes(embedding))

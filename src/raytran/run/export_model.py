@@ -13,7 +13,10 @@ from rich.console import Console
 from rich.table import Table
 
 from raytran.errors import ConfigError
-from raytran.run.checkpoint import model_from
+from raytran.run.build import plain
+from raytran.run.checkpoint import model_from, prediction_settings
+from raytran.run.export_program import SUFFIX as PROGRAM_SUFFIX
+from raytran.run.export_program import export_program
 from raytran.run.weights import checkpoint_path, export_weights
 from raytran.training.checkpoint_file import read_checkpoint
 from raytran.training.weights_file import PREFIX, SUFFIX
@@ -38,8 +41,14 @@ def export_model(cfg: DictConfig) -> Path | None:
     output = Path(cfg.output)
     _check_output(source, output)
     checkpoint = read_checkpoint(source)
-    model_from(checkpoint, source)  # what cannot be loaded is not given away
-    export_weights(checkpoint, source, output, dtype=str(cfg.dtype))
+    model = model_from(checkpoint, source)  # what cannot be loaded is not given away
+    if output.suffix == SUFFIX:
+        export_weights(checkpoint, source, output, dtype=cfg.dtype)
+    else:
+        if cfg.dtype != "float32":
+            raise ConfigError(f"dtype={cfg.dtype} is for {SUFFIX}: a program computes in float32")
+        size = prediction_settings(source).image_size
+        export_program(model, checkpoint, output, image_size=size, **plain(cfg.program))
     _log.info("wrote %s: %.1f MB", output.resolve(), output.stat().st_size / 1e6)
     return output
 
@@ -73,8 +82,8 @@ def described(checkpoint: Mapping[str, Any], path: Path) -> Table:
 
 
 def _check_output(source: Path, output: Path) -> None:
-    if output.suffix != SUFFIX:
-        raise ConfigError(f"output={output} has an unknown ending: choose {SUFFIX}")
+    if output.suffix not in (SUFFIX, PROGRAM_SUFFIX):
+        raise ConfigError(f"output={output} has an unknown ending: choose {SUFFIX} or {PROGRAM_SUFFIX}")
     if output.is_dir():
         raise ConfigError(f"output={output} is a folder: name a file")
     if output.exists() and source.exists() and output.samefile(source):

@@ -89,6 +89,11 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
             f"no checkpoint at {path}: give the path of a .ckpt file that training wrote, "
             "or of a .safetensors file that was exported from one"
         )
+    if path.suffix == ".pt2":
+        raise CheckpointError(
+            f"{path} is a program of torch.export, which holds no settings to build a network by: give the "
+            ".ckpt or .safetensors file that it was made from"
+        )
     if is_weights_file(path):
         return read_weights(path)
     _check_bytes(path)

@@ -55,7 +55,16 @@ def write_weights(path: Path, card: Mapping[str, Any], weights: Mapping[str, Ten
     copies = {name: value.detach().cpu().contiguous().clone() for name, value in weights.items()}
     text = json.dumps(card, ensure_ascii=False)
     header = {"format": "pt", "raytran": text, "sha256": _digest(text, copies)}
-    content = save(copies, metadata=header)  # not save_file, whose files only the owner may read
+    # Not save_file, whose files only the owner may read.
+    write_whole(path, save(copies, metadata=header))
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write ``content`` to ``path``, which appears whole or not at all; what was there is replaced.
+
+    Raises:
+        CheckpointError: the disk is full or does not take the file; what was there stays.
+    """
     partial = path.with_name(f"{path.name}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
