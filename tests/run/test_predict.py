@@ -138,6 +138,15 @@ def test_all_files_are_written(scene, oracle, tmp_path):
     assert [path.name for path in output.parent.iterdir()] == ["room"]
 
 
+def test_before_the_last_stage_there_are_boxes_but_no_meshes(scene, oracle, tmp_path, monkeypatch, caplog):
+    settings = PredictionSettings(preset="tiny", stage="joint", image_size=IMAGE_SIZE, num_views=96)
+    monkeypatch.setattr(module, "prediction_settings", lambda path: settings)
+    output = module.predict(config(scene, tmp_path / "out"))
+    content = json.loads((output / "scene.json").read_text())
+    assert [(o["category"], o["mesh"]) for o in content["objects"]] == [("chair", None)]
+    assert "boxes but no meshes" in caplog.text
+
+
 def test_the_viewer_gets_frames_voxels_and_errors(scene, oracle, tmp_path):
     truth = tmp_path / "truth.json"
     chair = {

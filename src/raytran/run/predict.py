@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Unpack
 
@@ -30,7 +31,7 @@ _LOG = logging.getLogger(__name__)
 
 _UNTRAINED = {
     "occupancy": "its objects mean nothing yet; predict with a checkpoint of stage shape",
-    "joint": "its meshes mean nothing yet; predict with a checkpoint of stage shape",
+    "joint": "it has learned no shapes yet, so there are boxes but no meshes: those need stage shape",
     "view": "it renders new views; its objects mean nothing unless stage.trainable left the backbone alone",
 }
 """Stage of the curriculum that is not the last → what to expect of its checkpoints."""
@@ -65,7 +66,7 @@ def predict(cfg: DictConfig) -> Path:
     scene_id = scene.stem if scene.is_file() else scene.name
     truth = read_truth(Path(cfg.truth), scene_id) if cfg.truth else None
     room = _read(cfg, world, settings, model)
-    found = _find(cfg, model, room, scene_id)
+    found = _find(cfg, model, room, scene_id, with_shapes=settings.stage == "shape")
     write_scene(
         output,
         found,
@@ -99,7 +100,9 @@ def predict_scene(model: RayTran, views: Views, **limits: Unpack[Limits]) -> Pre
     return PredictedScene(prediction, object_meshes(prediction), volumes=volumes)
 
 
-def _find(cfg: DictConfig, model: RayTran, room: RoomViews, scene_id: str) -> PredictedScene:
+def _find(
+    cfg: DictConfig, model: RayTran, room: RoomViews, scene_id: str, *, with_shapes: bool
+) -> PredictedScene:
     """Return the objects of a scene with what is made of them, and for the viewer how the network read it."""
     with observe_attention(model) if cfg.viewer else nullcontext() as observed:
         prediction = predict_room(
@@ -110,6 +113,8 @@ def _find(cfg: DictConfig, model: RayTran, room: RoomViews, scene_id: str) -> Pr
             duplicate_iou=cfg.duplicate_iou,
             views_at_once=cfg.views_at_once,
         )
+    if not with_shapes:  # The surface of noise has a quarter of a million triangles.
+        prediction = replace(prediction, objects=replace(prediction.objects, shape=None))
     volumes = None
     if cfg.viewer:
         several = len(room.members) > 1
