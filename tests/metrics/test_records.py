@@ -22,6 +22,7 @@ from raytran.metrics import (
     SSIM,
     ForegroundIoU,
     MatchedShapeScores,
+    NewViewScores,
     OrientedBoxF1,
     Scan2CADAccuracy,
     SceneOccupancyIoU,
@@ -30,7 +31,7 @@ from raytran.metrics.atlas import ErrorAtlas
 from raytran.metrics.curves import AccuracyCurves
 from raytran.metrics.functional.cad_errors import cad_half_extents, cad_symmetries
 from raytran.metrics.records import SceneRecord, decode_records
-from raytran.types import CadAlignments, ObjectSet
+from raytran.types import CadAlignments, ObjectSet, Views
 
 SCENES = 7
 SHARES = {"unequal": ((0, 3, 5, 6), (1, 2, 4)), "one without": ((0, 1, 2, 3, 4, 5, 6), ()),
@@ -107,7 +108,8 @@ def results(indices: tuple[int, ...], dtype: torch.dtype = torch.float32) -> dic
     }
     of_cells = {"occupancy": SceneOccupancyIoU(), "foreground": ForegroundIoU()}
     of_images = {"psnr": PSNR(), "ssim": SSIM()}
-    every = of_objects | of_cads | of_cells | of_images
+    new_views = NewViewScores()
+    every = of_objects | of_cads | of_cells | of_images | {"new_views": new_views}
     for index in indices:
         prediction, target, name = scene(index)
         for metric in of_objects.values():
@@ -122,6 +124,8 @@ def results(indices: tuple[int, ...], dtype: torch.dtype = torch.float32) -> dic
         found, true = torch.rand(2, 1, 1 + index, 3, 16, 16, generator=generator)
         for metric in of_images.values():
             metric.update(found, true, [name])
+        cameras = torch.eye(3).expand(1, 1 + index, 3, 3), torch.eye(4).expand(1, 1 + index, 4, 4)
+        new_views.update(found, Views(true, *cameras), Views(found, *cameras), [name])
         for metric in every.values():  # as Lightning does in a bf16 run
             metric.to(dtype)
     found = {key: metric.compute() for key, metric in every.items()}

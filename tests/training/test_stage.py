@@ -58,6 +58,39 @@ def test_a_step_reaches_what_the_stage_trains_and_nothing_else(experiment, batch
         assert (parameter.grad is not None) == expected, name
 
 
+@pytest.mark.parametrize(
+    ("settings", "trained"),
+    [
+        (["model=unprojection"], ("backbone.", "heads.view.")),
+        (
+            ["model.backbone.resnet.stride=8", "model.heads.foreground.widths=[32,16]"],
+            ("backbone.", "heads.view."),
+        ),
+        (["stage.trainable=[heads.view]"], ("heads.view.",)),
+        (
+            [
+                "stage.tasks=[occupancy,view]",
+                "stage.terms=[occupancy,view]",
+                "stage.trainable=[backbone,heads.occupancy,heads.view]",
+            ],
+            ("backbone.", "heads.occupancy.", "heads.view."),
+        ),
+    ],
+)
+def test_views_are_rendered_from_any_backbone_alone_or_along_with_other_tasks(
+    settings, trained, batch, make_module
+):
+    module = make_module("novel_view", *settings)
+    module.stage.freeze(module.model)
+    raw = module.model(**inputs_of(batch), tasks=module.stage.tasks)
+    assert raw.new_views.shape == batch.new_views.images.shape
+    module.loss(raw, batch, terms=module.stage.terms)["total"].backward()
+    learning = {name for name, parameter in module.model.named_parameters() if parameter.grad is not None}
+    assert learning == {name for name, p in module.model.named_parameters() if p.requires_grad}
+    assert {name for name in learning if not name.startswith(trained)} == set()
+    assert all(any(name.startswith(part) for name in learning) for part in trained)
+
+
 @pytest.mark.parametrize("experiment", list(TRAINED))
 def test_a_fit_moves_what_the_stage_trains_and_nothing_else(experiment, batch, make_module):
     module = make_module(experiment)
