@@ -62,7 +62,7 @@ def write(output: Path, found: PredictedScene, views: Views, turntable: int = 0)
         views,
         ["0", "5"],
         grid_extent=(4.0, 4.0, 2.0),
-        num_overlays=1,
+        num_overlays=0,
         turntable=turntable,
     )
     return {path.name for path in output.iterdir()}

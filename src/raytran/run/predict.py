@@ -22,7 +22,7 @@ from raytran.run.checkpoint import PredictionSettings, load_model, prediction_se
 from raytran.run.device import choose_device
 from raytran.run.output import check_replaceable
 from raytran.run.render_views import cameras_to_render, render_views
-from raytran.run.scene_files import MARKER, PredictedScene, write_scene
+from raytran.run.scene_files import MARKER, PredictedScene, check_pictures, write_scene
 from raytran.run.viewed import read_truth, viewed_volumes
 from raytran.run.volumes import Limits, RoomViews, check_choice, predict_room, predict_volume, read_room
 from raytran.types import Views
@@ -54,6 +54,7 @@ def predict(cfg: DictConfig) -> Path:
     scene, output = Path(cfg.scene).resolve(), Path(cfg.output)
     world = WorldSettings(up=cfg.up, scale=cfg.scale, convention=cfg.convention, check=cfg.check)
     check_choice(cfg.frames, cfg.num_views)
+    check_pictures(num_overlays=cfg.num_overlays, turntable=cfg.turntable)
     check_replaceable(output.resolve(), marker=MARKER)
     if cfg.cads:
         shapenet_version(Path(cfg.cads))  # It raises where there are none, before the network runs.

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import trimesh
 
+from raytran.errors import ConfigError
 from raytran.export import write_prediction
 from raytran.export.glb import write_glb
 from raytran.export.nearest_cad import NearestCads, nearest_cads
@@ -49,6 +50,17 @@ class PredictedScene:
         """
         cads = nearest_cads(self.prediction.objects, root)
         return replace(self, prediction=replace(self.prediction, objects=cads.objects), cads=cads)
+
+
+def check_pictures(**counts: object) -> None:
+    """Raise unless each of the settings is a number of pictures.
+
+    Raises:
+        ConfigError: one is not; it is named.
+    """
+    for name, count in counts.items():
+        if isinstance(count, bool) or not isinstance(count, int) or count < 0:
+            raise ConfigError(f"{name}={count} is no number of pictures: give 0 or more")
 
 
 def write_scene(
