@@ -19,7 +19,7 @@ from jupyter_client.manager import KernelManager
 from nbclient import NotebookClient
 
 FOLDER = Path(__file__).resolve().parent
-SECONDS = 120
+SECONDS = 300
 """A cell that takes longer is stopped."""
 
 
