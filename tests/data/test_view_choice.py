@@ -104,6 +104,7 @@ def test_frames_that_see_nothing_of_the_volume_come_last_and_evenly_if_none_does
     away = cameras([(100.0 + n, 0, 1.5) for n in range(10)], [0.0] * 10)
     assert choose_by_coverage(away, GRID, 2).frames == (2, 7)
     assert choose_by_coverage(away, GRID, 20).frames == tuple(range(10))
+    assert choose_by_coverage(cameras([], []), GRID, 20).frames == ()
 
 
 @pytest.mark.parametrize("count", [0, 1, 5])

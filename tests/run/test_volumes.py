@@ -235,6 +235,27 @@ def test_of_a_long_video_some_frames_are_looked_at(hall, monkeypatch, caplog):
     assert "chose 20 of 20 frames" in caplog.text
 
 
+def test_one_frame_is_too_few_unless_one_is_asked_for(tmp_path):
+    write_scan(tmp_path / "a", [(0.0, 0.0, 1.5)], [0.0])
+    for frames in ("coverage", "even"):
+        with pytest.raises(DataError, match=r"a has 1 frame with an image and a pose, and 2 are needed"):
+            read(tmp_path / "a", frames=frames)
+        assert read(tmp_path / "a", frames=frames, num_views=1).frame_ids == ("0",)
+
+
+def test_a_volume_with_blurred_frames_alone_takes_them(hall, caplog):
+    caplog.set_level("INFO")
+    everything = read(hall, frames="even", num_views=100, extent=(3.0, 3.0, 3.5))
+    own = {everything.frame_ids[place] for place in everything.members[0]}
+    assert 2 < len(own) < 30
+    for name in own:
+        Image.new("RGB", (48, 32), (90, 90, 90)).save(hall / "color" / f"{name}.png")
+    room = read(hall, extent=(3.0, 3.0, 3.5))
+    assert f"{len(own)} that are blurred" in caplog.text
+    assert len(room.members[0]) == 12
+    assert {room.frame_ids[place] for place in room.members[0]} <= own
+
+
 def test_positions_in_millimetres_are_refused_by_name(tmp_path):
     write_scan(tmp_path / "garage", [(900.0 * n, 0.0, 1500.0) for n in range(5)], [90.0] * 5)
     with pytest.raises(DataError, match=r"cameras of garage see .* m, .*: give scale="):

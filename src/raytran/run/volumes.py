@@ -17,7 +17,7 @@ from raytran.data.scannet import report_dropped, scan_views
 from raytran.data.sharpness import blurred_frames
 from raytran.data.view_choice import choose_by_coverage
 from raytran.data.views import choose_even
-from raytran.errors import ConfigError
+from raytran.errors import ConfigError, DataError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.volumes import Volumes, cover
@@ -99,7 +99,8 @@ def read_room(
         extent: sizes of a volume, metres.
 
     Raises:
-        DataError: fewer than two frames can be read, or the cameras' positions cannot be metres.
+        DataError: fewer than two frames can be read, though more are asked for; or the cameras' positions
+            cannot be metres.
     """
     report_dropped(scan)
     poses = scan.world_from_camera
@@ -122,6 +123,11 @@ def read_room(
     views, used = scan_views(scan, wanted, image_size=image_size)
     first = {frame: place for place, frame in reversed(list(enumerate(used)))}
     kept = sorted(first)
+    if len(kept) < min(MIN_VIEWS, num_views):
+        raise DataError(
+            f"{scan.path} has {len(kept)} frame with an image and a pose, and {MIN_VIEWS} are needed: "
+            "give 20 or more that show the room from all sides"
+        )
     # What was read in place of a damaged image belongs where it looks.
     members = [
         tuple(
