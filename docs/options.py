@@ -75,7 +75,7 @@ def header(path: Path) -> str:
             break
         if not line.startswith("# @package"):
             words.append(line.lstrip("# "))
-    return re.split(r"\.(?:\s|$)", " ".join(words), maxsplit=1)[0]
+    return re.split(r"(?<!e\.g)\.(?:\s|$)", " ".join(words), maxsplit=1)[0]
 
 
 def _package(text: str, folder: str) -> str:
