@@ -34,6 +34,7 @@ def make_model(
     stride: int = 16,
     widths: tuple[int, ...] = (8, 8, 4),
     queries: Literal["learned", "proposal"] = "learned",
+    num_copies: int = 0,
 ) -> RayTran:
     torch.manual_seed(0)
     heads = {
@@ -45,6 +46,7 @@ def make_model(
             num_layers=2,
             num_queries=5,
             queries=queries,
+            num_copies=num_copies,
             hidden=16,
             grid_extent=EXTENT,
         ),
@@ -96,6 +98,24 @@ def test_only_what_was_asked_for() -> None:
     assert raw.occupancy is not None
     assert raw.foreground is None
     assert raw.objects is None
+
+
+def test_copies_of_the_truth_are_corrected_in_training_alone() -> None:
+    model, views, known = make_model(num_copies=4).train(), make_views(), (make_objects(3),)
+    raw = model(views, tasks=("objects",), known=known)
+    assert [layer.center.shape for layer in raw.copies] == [(1, 4, 3)] * 2
+    batch = SceneBatch(("a",), views, ((),), raw.grid_center, objects=known)
+    loss = TotalLoss(weights=WEIGHTS, matcher=HungarianMatcher(weights=WEIGHTS))
+    losses = loss(raw, batch, terms=("objects",))
+    assert {f"objects/{name}/copies" for name in ("class", "center", "size", "yaw")} < set(losses)
+    parts = [value for name, value in losses.items() if name != "total"]
+    torch.testing.assert_close(losses["total"], torch.stack(parts).sum())
+    losses["total"].backward()
+    assert model.heads["objects"].copies.embedding.grad.abs().sum() > 0
+    with torch.no_grad():
+        told, alone = model.eval()(views, known=known), model(views)
+    assert told.copies is None
+    assert torch.equal(told.objects[-1].center, alone.objects[-1].center)
 
 
 def test_volume_is_centred_on_the_cameras_unless_told() -> None:

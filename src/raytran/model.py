@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +20,7 @@ from raytran.backbone.lifting import LiftingBackbone
 from raytran.errors import ConfigError, ShapeError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
+from raytran.heads.objects import ObjectHead
 from raytran.heads.slots import objects_of_slots
 from raytran.ops.block_pairs import BlockPairs
 from raytran.ops.pairs import PairList
@@ -38,6 +39,7 @@ def inputs_of(batch: SceneBatch) -> dict[str, Any]:
     return {
         "views": batch.views,
         "grid_center": batch.grid_center,
+        "known": batch.objects,
         "new_cameras": None if batch.new_views is None else Cameras.of(batch.new_views),
     }
 
@@ -87,6 +89,7 @@ class RayTran(nn.Module):
         grid_center: Tensor | None = None,
         views_at_once: int | None = None,
         new_cameras: Cameras | None = None,
+        known: Sequence[ObjectSet] | None = None,
     ) -> RawScene:
         """Run the backbone once and the heads of ``tasks``.
 
@@ -97,6 +100,7 @@ class RayTran(nn.Module):
             views_at_once: views that pass through the network together, so that memory hardly grows with
                 their number; for prediction only. None: all of them.
             new_cameras: what ``view`` renders, of leading shape ``(B, V)``; no other task sees them.
+            known: true objects of the scenes, for ``RawScene.copies`` in training; no other task sees them.
 
         Returns:
             Raw predictions, None for what was not asked for.
@@ -111,13 +115,20 @@ class RayTran(nn.Module):
         center = cameras.position.mean(dim=1) if grid_center is None else grid_center
         grid = VoxelGrid(self.grid_resolution, self.grid_extent, center)
         voxels, pixels = self._lift(views.images, cameras, grid, "foreground" in tasks, views_at_once)
-        objects, proposals = self.heads["objects"](voxels, grid) if "objects" in tasks else (None, None)
+        objects = proposals = copies = None
+        if "objects" in tasks:
+            head = cast("ObjectHead", self.heads["objects"])
+            if known is not None and head.makes_copies:
+                objects, proposals, copies = head.forward_with_copies(voxels, grid, known)
+            else:
+                objects, proposals = head(voxels, grid)
         return RawScene(
             grid_center=center,
             occupancy=self.heads["occupancy"](voxels) if "occupancy" in tasks else None,
             foreground=None if pixels is None else self._foreground(pixels, views_at_once),
             objects=objects,
             proposals=proposals,
+            copies=copies,
             new_views=self._render(voxels, grid, new_cameras) if "view" in tasks else None,
         )
 

@@ -12,8 +12,7 @@ Shape letters, used in every docstring of the project:
 ``S``  cells along one side of a shape grid (63)       ``L``     decoder layers
 ====== =============================================== ====== ==================================
 
-Metres, radians; world right-handed with +Z up; cameras OpenCV (x right, y down, z forward); objects in
-ShapeNet's frame (+Y up, front -Z). ``CONVENTIONS.md`` says all of this at length.
+Units, frames and signs are in ``CONVENTIONS.md``.
 """
 
 from __future__ import annotations
@@ -266,6 +265,7 @@ class RawScene(Parcel):
         objects: one ``RawObjects`` per decoder layer, last layer last.
         proposals: where the queries of ``objects`` come from; None if they are learned.
         new_views: ``(B, V, 3, H, W)`` logits of red, green and blue.
+        copies: as ``objects``, of noisy copies of the true ones; slot i is of object i modulo M.
     """
 
     grid_center: Tensor
@@ -274,6 +274,7 @@ class RawScene(Parcel):
     objects: tuple[RawObjects, ...] | None = None
     proposals: RawProposals | None = None
     new_views: Tensor | None = None
+    copies: tuple[RawObjects, ...] | None = None
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,13 @@ class DecoderLayer(nn.Module):
         )
 
     def forward(
-        self, queries: Tensor, position: Tensor, reference: Tensor, memory: Tensor, voxel_position: Tensor
+        self,
+        queries: Tensor,
+        position: Tensor,
+        reference: Tensor,
+        memory: Tensor,
+        voxel_position: Tensor,
+        mask: Tensor | None = None,
     ) -> Tensor:
         """Return the queries after the layer.
 
@@ -52,13 +58,15 @@ class DecoderLayer(nn.Module):
             reference: ``(B, Q, 3)`` reference points, metres from the centre of the volume.
             memory: ``(B, V, C)`` voxel features with the code of their positions.
             voxel_position: ``(V, 3)`` voxel centres, metres from the centre of the volume.
+            mask: ``(Q, Q)`` bool, True where the query of a row must not attend to that of a column.
 
         Returns:
             ``(B, Q, C)``.
         """
         x = self.self_norm(queries)
         located = x + position
-        queries = queries + self.self_attention(located, located, x, need_weights=False)[0]
+        attended, _ = self.self_attention(located, located, x, need_weights=False, attn_mask=mask)
+        queries = queries + attended
         located = self.voxel_norm(queries) + position
         queries = queries + self.voxel_attention(located, reference, memory, voxel_position)
         return queries + self.feed_forward(queries)

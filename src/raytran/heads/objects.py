@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import fields
 from typing import Literal
 
 import torch
@@ -13,8 +14,9 @@ from raytran.errors import ConfigError
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.position import position_code
 from raytran.heads.decoder import DecoderLayer
+from raytran.heads.denoising import NoisyCopies, attention_mask, join_queries
 from raytran.heads.queries import LearnedQueries, ProposalQueries, Queries
-from raytran.types import CLASSES, RawObjects, RawProposals
+from raytran.types import CLASSES, ObjectSet, RawObjects, RawProposals
 
 
 class ObjectHead(nn.Module):
@@ -36,10 +38,12 @@ class ObjectHead(nn.Module):
             few scenes; False attends to all voxels alike, as in DETR and the paper.
         refines: what a layer hands on to the next, which predicts the difference: ``"center"``, or ``"box"``,
             size and yaw too (iterative box refinement in Deformable DETR).
+        num_copies: noisy copies of the true objects that a scene's queries are joined by in training, to be
+            corrected (``raytran.heads.denoising``); 0 for none, as in the paper.
         grid_extent: sizes of the voxel grid, metres.
 
     Raises:
-        ConfigError: ``queries`` or ``refines`` is unknown.
+        ConfigError: ``queries`` or ``refines`` is unknown, or ``num_copies`` is negative.
     """
 
     extent: Tensor
@@ -55,6 +59,7 @@ class ObjectHead(nn.Module):
         hidden: int = 1024,
         windowed: bool = False,
         refines: Literal["center", "box"] = "center",
+        num_copies: int = 0,
         grid_extent: Sequence[float] = (9.0, 9.0, 3.5),
     ) -> None:
         super().__init__()
@@ -62,6 +67,8 @@ class ObjectHead(nn.Module):
             raise ConfigError(f"unknown queries={queries}: choose learned or proposal")
         if refines not in ("center", "box"):
             raise ConfigError(f"unknown refines={refines}: choose center or box")
+        if num_copies < 0:
+            raise ConfigError(f"num_copies must be 0 or more, got {num_copies}")
         self.refines = refines
         self.grid_extent = tuple(float(length) for length in grid_extent)
         self.register_buffer("extent", torch.tensor(self.grid_extent), persistent=False)
@@ -76,6 +83,8 @@ class ObjectHead(nn.Module):
             for _ in range(num_layers)
         )
         self.predictors = nn.ModuleList(ObjectPredictor(channels=channels) for _ in range(num_layers))
+        # Last, so that the other parts start from the same weights with and without.
+        self.copies = NoisyCopies(channels=channels, num_copies=num_copies) if num_copies else None
 
     def forward(self, voxels: Tensor, grid: VoxelGrid) -> tuple[tuple[RawObjects, ...], RawProposals | None]:
         """Return the predictions of every layer, last layer last, and the proposals if queries are proposed.
@@ -84,21 +93,58 @@ class ObjectHead(nn.Module):
             voxels: ``(B, X, Y, Z, C)`` features.
             grid: the voxel grids, ``center`` ``(B, 3)``.
         """
+        start: Queries = self.queries(voxels, grid)
+        return self._decode(start, voxels, grid), start.proposals
+
+    @property
+    def makes_copies(self) -> bool:
+        """Whether ``forward_with_copies`` has any: in training mode, if there are to be any."""
+        return self.copies is not None and self.training
+
+    def forward_with_copies(
+        self, voxels: Tensor, grid: VoxelGrid, known: Sequence[ObjectSet]
+    ) -> tuple[tuple[RawObjects, ...], RawProposals | None, tuple[RawObjects, ...]]:
+        """Return what ``forward`` does, and the predictions of every layer for noisy copies of true objects.
+
+        The copies change nothing of the others.
+
+        Args:
+            voxels: ``(B, X, Y, Z, C)`` features.
+            grid: the voxel grids, ``center`` ``(B, 3)``.
+            known: the true objects of B scenes.
+
+        Raises:
+            ConfigError: the head makes no copies.
+        """
+        if self.copies is None:
+            raise ConfigError("this object head makes no copies: set model.heads.objects.num_copies")
+        start: Queries = self.queries(voxels, grid)
+        count = start.embedding.shape[1]
+        mask = attention_mask(count, self.copies.num_copies, voxels.device)
+        joined = join_queries(start, self.copies(known, start, grid))
+        layers = self._decode(joined, voxels, grid, mask)
+        own = tuple(_slots(layer, slice(count)) for layer in layers)
+        return own, start.proposals, tuple(_slots(layer, slice(count, None)) for layer in layers)
+
+    def _decode(
+        self, start: Queries, voxels: Tensor, grid: VoxelGrid, mask: Tensor | None = None
+    ) -> tuple[RawObjects, ...]:
+        """Return the predictions of every layer for the queries of ``start``."""
         grid_center = grid.center.to(self.extent.dtype)
         at_origin = VoxelGrid(grid.resolution, grid.extent, torch.zeros_like(self.extent))
         voxel_position = at_origin.voxel_centers().flatten(0, 2)
         memory = voxels.flatten(1, 3) + self._locate(voxel_position)
-        start: Queries = self.queries(voxels, grid)
         embedding, box = start.embedding, start
         outputs = []
         for layer, predictor in zip(self.layers, self.predictors, strict=True):
-            embedding = layer(embedding, self._locate(box.reference), box.reference, memory, voxel_position)
+            position = self._locate(box.reference)
+            embedding = layer(embedding, position, box.reference, memory, voxel_position, mask)
             objects = predictor(embedding, box, grid_center)
             box = box._replace(reference=objects.center - grid_center[:, None])
             if self.refines == "box":
                 box = box._replace(log_size=objects.log_size, yaw_vector=objects.yaw_vector)
             outputs.append(objects)
-        return tuple(outputs), start.proposals
+        return tuple(outputs)
 
     def _locate(self, points: Tensor) -> Tensor:
         """Return the code ``(..., C)`` of points ``(..., 3)``, metres from the centre of the volume."""
@@ -133,6 +179,10 @@ class ObjectPredictor(nn.Module):
             yaw_vector=start.yaw_vector + self.yaw(embedding).float(),
             embedding=embedding,
         )
+
+
+def _slots(objects: RawObjects, some: slice) -> RawObjects:
+    return RawObjects(*(getattr(objects, field.name)[:, some] for field in fields(objects)))
 
 
 def _perceptron(channels: int, outputs: int) -> nn.Sequential:

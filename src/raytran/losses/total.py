@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from raytran.errors import ConfigError, DataError
+from raytran.losses.denoising import denoising_losses
 from raytran.losses.foreground import foreground_loss
 from raytran.losses.matcher import HungarianMatcher, Match
 from raytran.losses.objects import object_losses
@@ -74,7 +75,8 @@ class TotalLoss(nn.Module):
         Returns:
             ``occupancy``, ``foreground``, ``shape``, ``view``; ``objects/class``, ``objects/center``,
             ``objects/size``, ``objects/yaw`` of the last decoder layer, ``objects/class/layer0`` and so on of
-            earlier ones, ``objects/heat/proposals`` and so on of the proposals, if the network makes any.
+            earlier ones, ``objects/heat/proposals`` and so on of the proposals, if the network makes any,
+            ``objects/class/copies`` and so on of noisy copies, all layers together.
 
         Raises:
             ConfigError: a term is unknown, or the network was not asked for it.
@@ -133,6 +135,9 @@ class TotalLoss(nn.Module):
         if "objects" in terms and raw.proposals is not None:
             found = proposal_losses(raw.proposals, targets, num_objects=num_objects)
             losses |= {f"objects/{name}/proposals": value for name, value in found.items()}
+        if "objects" in terms and raw.copies is not None:
+            found = denoising_losses([_in_float32(layer) for layer in raw.copies], targets)
+            losses |= {f"objects/{name}/copies": value for name, value in found.items()}
         return losses
 
     def _divisors(
