@@ -110,11 +110,10 @@ def cover(
     points = torch.cat([position, places_ahead(cameras).double()])
     low, high = points.amin(dim=0), points.amax(dim=0)
     mean = position.mean(dim=0)
+    ends = torch.stack([low, high, mean], dim=1).tolist()
     axes = [
-        _along_axis(*ends, length=length, count=count)
-        for ends, length, count in zip(
-            zip(low.tolist(), high.tolist(), mean.tolist(), strict=True), extent, resolution, strict=True
-        )
+        _along_axis(*three, length=length, count=count)
+        for three, length, count in zip(ends, extent, resolution, strict=True)
     ]
     number = math.prod(map(len, axes))
     if number > MOST:

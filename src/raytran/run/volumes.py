@@ -108,10 +108,9 @@ def read_room(
     volumes, looks_into = cover(cameras, resolution=resolution, extent=extent, name=scan.scene_id)
     choose = _by_coverage if frames == "coverage" else _evenly
     chosen = choose(scan, cameras, volumes, looks_into, num_views)
-    wanted = sorted({frame for own in chosen for frame in own})
     if len(volumes) == 1:
         # On the cameras that are used, as in training.
-        volumes, _ = cover(_some(cameras, wanted), resolution=resolution, extent=extent)
+        volumes, _ = cover(_some(cameras, chosen[0]), resolution=resolution, extent=extent)
     else:
         _log.info(
             "%s is larger than the volume of %s m: predicted in %d that overlap, from %s frames",
@@ -120,30 +119,7 @@ def read_room(
             len(volumes),
             ", ".join(str(len(own)) for own in chosen),
         )
-    views, used = scan_views(scan, wanted, image_size=image_size)
-    first = {frame: place for place, frame in reversed(list(enumerate(used)))}
-    kept = sorted(first)
-    if len(kept) < min(MIN_VIEWS, num_views):
-        raise DataError(
-            f"{scan.path} has {len(kept)} frame with an image and a pose, and {MIN_VIEWS} are needed: "
-            "give 20 or more that show the room from all sides"
-        )
-    # What was read in place of a damaged image belongs where it looks.
-    members = [
-        tuple(
-            place
-            for place, frame in enumerate(kept)
-            if frame in own or (frame not in wanted and there[frame])
-        )
-        for own, there in zip(map(set, chosen), looks_into, strict=True)
-    ]
-    filled = [index for index, own in enumerate(members) if own]
-    return RoomViews(
-        views=_some_views(views, [first[frame] for frame in kept]),
-        frame_ids=tuple(scan.frame_id[frame] for frame in kept),
-        volumes=Volumes(resolution, extent, volumes.center[filled]),
-        members=tuple(members[index] for index in filled),
-    )
+    return _read_chosen(scan, volumes, chosen, looks_into, image_size, fewest=min(MIN_VIEWS, num_views))
 
 
 def predict_room(model: RayTran, room: RoomViews, **limits: Unpack[Limits]) -> ScenePrediction:
@@ -201,6 +177,39 @@ def predict_volume(
     )
     found = select_objects(raw.to("cpu"), score_threshold=score_threshold, duplicate_iou=duplicate_iou)
     return replace(found, objects=count_object_views(found, grid_extent=model.grid_extent))
+
+
+def _read_chosen(
+    scan: OpenScan,
+    volumes: Volumes,
+    chosen: Sequence[tuple[int, ...]],
+    looks_into: Tensor,
+    image_size: tuple[int, int],
+    *,
+    fewest: int,
+) -> RoomViews:
+    """Read the frames chosen for each volume, each once; volumes are left out of which none can be read."""
+    wanted = sorted({frame for own in chosen for frame in own})
+    views, used = scan_views(scan, wanted, image_size=image_size)
+    first = {frame: place for place, frame in reversed(list(enumerate(used)))}
+    kept = sorted(first)
+    if len(kept) < fewest:
+        raise DataError(
+            f"{scan.path} has {len(kept)} frame with an image and a pose, and {fewest} are needed: "
+            "give 20 or more that show the room from all sides"
+        )
+    # What was read in place of a damaged image belongs where it looks.
+    members = [
+        tuple(n for n, frame in enumerate(kept) if frame in own or (frame not in wanted and there[frame]))
+        for own, there in zip(map(set, chosen), looks_into, strict=True)
+    ]
+    filled = [index for index, own in enumerate(members) if own]
+    return RoomViews(
+        views=_some_views(views, [first[frame] for frame in kept]),
+        frame_ids=tuple(scan.frame_id[frame] for frame in kept),
+        volumes=Volumes(volumes.resolution, volumes.extent, volumes.center[filled]),
+        members=tuple(members[index] for index in filled),
+    )
 
 
 def _evenly(
