@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import shutil
 import struct
+import zlib
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
@@ -98,3 +99,12 @@ _NAMES = {
     "frames_25k": ("color/{:06d}.jpg", "pose/{:06d}.txt", "intrinsics_color.txt"),
 }
 """Names of image and pose of frame n and of the intrinsics, in each form."""
+
+
+def write_claiming_png(path: Path, side: int) -> None:
+    """Write a picture of a few bytes whose header claims ``side × side`` pixels."""
+    Image.new("RGB", (16, 8)).save(path, format="png")
+    content = bytearray(path.read_bytes())
+    content[16:24] = struct.pack(">II", side, side)
+    content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
+    path.write_bytes(content)

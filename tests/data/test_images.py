@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import logging
-import struct
-import zlib
 
 import numpy as np
 import pytest
@@ -14,6 +12,8 @@ from PIL import Image
 
 from raytran.data.images import decode_image, read_image, read_images, resize, stored_size
 from raytran.errors import DataError
+
+from .scan_forms import write_claiming_png
 
 
 @pytest.fixture
@@ -151,11 +151,7 @@ def test_stored_size_is_height_and_width(paths) -> None:
 @pytest.mark.parametrize("side", [9_000, 100_000])
 def test_an_image_that_claims_too_many_pixels_is_not_decoded(tmp_path, side) -> None:
     """A few bytes, whose header promises a picture that would fill the memory."""
-    Image.new("RGB", (16, 8)).save(tmp_path / "a.png")
-    content = bytearray((tmp_path / "a.png").read_bytes())
-    content[16:24] = struct.pack(">II", side, side)
-    content[29:33] = struct.pack(">I", zlib.crc32(content[12:29]))
-    (tmp_path / "a.png").write_bytes(content)
+    write_claiming_png(tmp_path / "a.png", side)
     with pytest.raises(DataError, match=r"claims 9000x9000 pixels, and at most 8192|exceeds limit"):
         read_image(tmp_path / "a.png", (8, 16))
     with pytest.raises(DataError, match=r"pixels, and at most 8192|can be read"):

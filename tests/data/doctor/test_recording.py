@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from raytran.data.doctor.matches import Matches
@@ -11,6 +12,7 @@ from raytran.data.doctor.recording import Recording
 from raytran.data.doctor.sightings import depth_at, sightings_from_depth, sightings_from_matches
 from raytran.data.scannet import read_scan
 
+from ..scan_forms import write_claiming_png
 from .conftest import SCAN
 
 
@@ -62,6 +64,16 @@ def test_depth_maps_give_rays_that_end_where_they_say(copy):
     ends = sightings.points(poses)
     seen = np.einsum("nji,nj->ni", poses[sightings.frame, :3, :3], ends - poses[sightings.frame, :3, 3])
     np.testing.assert_allclose(seen[:, 2], sightings.depth, atol=1e-5)  # Stored poses have seven digits.
+
+
+@pytest.mark.parametrize("side", [9_000, 100_000])
+def test_a_depth_map_that_claims_too_many_pixels_is_none(copy, side):
+    recording = with_depth(copy, np.full((90, 120), 2.0), [0, 1])
+    write_claiming_png(
+        copy / "scannet" / "scans" / SCAN / "depth" / f"{recording.scan.frame_id[1]}.png", side
+    )
+    assert recording.read_depth(0) is not None
+    assert recording.read_depth(1) is None
 
 
 def test_depth_of_matches_is_unknown_without_a_map(copy):

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from raytran.data.images import MAX_SIDE
 from raytran.data.scan import OpenScan, Scan, SensScan
 from raytran.errors import DataError
 
@@ -69,9 +70,11 @@ class Recording:
             if path is None:
                 return None
             with Image.open(path) as image:
+                if max(image.size) > MAX_SIDE:
+                    return None
                 depth = np.asarray(image, dtype=np.float64) / _MILLIMETRES
             return depth if depth.ndim == 2 else None
-        except (DataError, OSError, SyntaxError, ValueError):
+        except (DataError, OSError, SyntaxError, ValueError, Image.DecompressionBombError):
             return None
 
     def with_depth(self) -> list[int]:
