@@ -118,6 +118,27 @@ def test_proportions_decide_between_like_shapes(library):
     assert find(replace(wide, shape=empty), library).objects.model_id == (f"{CHAIR}/bench",)
 
 
+def test_the_best_of_all_is_found(library):
+    """Against every model, by the definition: IoU of the cells times IoU of the boxes at one diagonal."""
+    chairs = [(CHAIR, name) for catid, name in MODELS if catid == CHAIR]
+    objects = objects_like(library, *chairs, *chairs, noise=0.35)
+    meshes = [read_mesh(library, *names) for names in chairs]
+    fits = np.zeros((len(objects), len(chairs)))
+    for k, mesh in enumerate(meshes):
+        cells, extents = voxelize_solid(mesh.vertices, mesh.faces, size=SIDE), np.ptp(mesh.vertices, axis=0)
+        for m, (size, shape) in enumerate(
+            zip(objects.size.numpy(), objects.shape.numpy() > 0.5, strict=True)
+        ):
+            one, other = extents / np.linalg.norm(extents), size / np.linalg.norm(size)
+            common = np.minimum(one, other).prod()
+            boxes = common / (one.prod() + other.prod() - common)
+            fits[m, k] = boxes * (cells & shape).sum() / (cells | shape).sum()
+    expected = tuple("/".join(chairs[k]) for k in fits.argmax(axis=1))
+    assert find(objects, library).objects.model_id == expected
+    # Noise this strong makes some of them fit another model better.
+    assert expected != tuple("/".join(names) for names in (*chairs, *chairs))
+
+
 def test_models_that_cannot_win_are_not_read(library, monkeypatch):
     read: list[str] = []
     inner = module._read_cells
