@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -67,6 +67,16 @@ def make_views(count: int, size: tuple[int, int]) -> Views:
     return Views(ramp, intrinsics.expand(1, count, 3, 3), pose)
 
 
+def make_reads(views: Views, frames: Sequence[int], grid: VoxelGrid) -> VoxelReads:
+    """Every voxel reads all pixels that see it alike."""
+    index, size = list(frames), views.image_size
+    cameras = Cameras(views.intrinsics[0, index], views.world_from_camera[0, index], size)
+    pairs = trace_pairs(cameras, grid, (size[0] // 16, size[1] // 16))
+    counts = pairs.pixels_per_voxel()
+    weight = torch.repeat_interleave(1 / counts[counts > 0], counts[counts > 0])
+    return VoxelReads(pairs, weight, (size[0] // 16, size[1] // 16))
+
+
 def write_result(
     folder: Path,
     *,
@@ -75,8 +85,12 @@ def write_result(
     size: tuple[int, int] = (48, 64),
     subdivisions: int = 2,
     with_view: bool = True,
+    in_parts: bool = False,
 ) -> Path:
-    """Write a scene of which the truth is known: object 0 is as predicted, the others stand 30 cm beside."""
+    """Write a scene of which the truth is known: object 0 is as predicted, the others stand 30 cm beside.
+
+    In parts, each half of the frames belongs to a volume of its own, which lies a metre left or right.
+    """
     folder.mkdir(parents=True)
     resolution = (16, 16, 6)
     objects, views = make_objects(num_objects), make_views(num_frames, size)
@@ -85,20 +99,21 @@ def write_result(
     prediction = ScenePrediction(folder.name, objects, grid.center)
     write_prediction(folder, prediction, [make_mesh(objects, n, subdivisions) for n in range(num_objects)])
     if with_view:
-        pairs = trace_pairs(Cameras(views.intrinsics[0], views.world_from_camera[0], size), grid, (3, 4))
-        counts = pairs.pixels_per_voxel()
-        weight = torch.repeat_interleave(1 / counts[counts > 0], counts[counts > 0])
         volume = ViewedVolume(
             grid=grid,
             frames=range(num_frames),
             occupancy=(centers[..., 2] < 0.6) & (centers[..., :2].norm(dim=-1) < 3) & (centers[..., 0] > 0),
-            seen=counts.view(resolution),
-            reads=VoxelReads(pairs, weight, (3, 4)),
+            seen=make_reads(views, range(num_frames), grid).pairs.pixels_per_voxel().view(resolution),
+            reads=None if in_parts else make_reads(views, range(num_frames), grid),
         )
+        volumes = [volume]
+        for frames, x in [(range(num_frames // 2), -1.0), (range(num_frames // 2, num_frames), 1.0)]:
+            part = VoxelGrid(resolution, EXTENT, torch.tensor([x, 0.0, 1.0]))
+            volumes += [ViewedVolume(part, frames, reads=make_reads(views, frames, part))] if in_parts else []
         truth = make_objects(num_objects)
         truth.center[1:, 1] += 0.3
         names = [f"{10 * n:06d}" for n in range(num_frames)]
-        write_view_data(folder, prediction, views, names, volumes=[volume], truth=truth)
+        write_view_data(folder, prediction, views, names, volumes=volumes, truth=truth)
     return folder
 
 

@@ -128,6 +128,7 @@ def test_boxes_and_meshes_are_drawn_where_they_are(seen):
 def test_a_slider_hides_what_is_weak(seen):
     assert seen.text("#count") == "6 of 6"
     assert "1 of 6 true objects found" in seen.text("#found")
+    assert "missed: bookshelf, cabinet, chair, display, sofa." in seen.text("#found")
     seen.show("meshes", "boxes")
     before = seen.draw()
     seen.run(
@@ -224,10 +225,17 @@ def test_many_scenes_and_what_they_lack(browser, tmp_path, serve):
     (bare / "scene.glb").write_bytes(b"glTF, but not really")
     damaged = write_result(tmp_path / "all" / "damaged", num_objects=1, with_view=False)
     (damaged / "scene.json").write_text('{"format": "raytran.scene/9"}')
-    write_result(tmp_path / "all" / "full", num_objects=2, num_frames=2)
+    write_result(tmp_path / "all" / "full", num_objects=2, num_frames=4, in_parts=True)
+    empty = write_result(tmp_path / "all" / "too long", num_objects=1, num_frames=2)
+    (empty / "view" / "volume0_occupancy.gz").write_bytes(gzip.compress(bytes(10_000_000)))
     with serve(tmp_path / "all") as server:
         seen = Seen(browser, server.url)
-        assert seen.page.locator("#scenes option").all_inner_texts() == ["bare", "damaged", "full"]
+        assert seen.page.locator("#scenes option").all_inner_texts() == [
+            "bare",
+            "damaged",
+            "full",
+            "too long",
+        ]
         assert "no meshes" in seen.text("#status")
         assert seen.text("#count") == "3 of 3"
         assert not seen.page.is_visible("#frame")
@@ -239,6 +247,15 @@ def test_many_scenes_and_what_they_lack(browser, tmp_path, serve):
         assert seen.text("#count") == "2 of 2"
         assert seen.page.is_visible("#frame")
         assert seen.text("#status") == ""
+        # The right half of a large room, of which only the last two frames tell.
+        seen.run("raytran.pickVoxel([0.7, 0.2, 0.2])")
+        seen.until("raytran.state.reads !== null")
+        assert {read["frame"] for read in seen.run("raytran.state.reads")} <= {2, 3}
+        assert re.search(
+            r"It read \d+ pixels of (1 frame|2 frames), most of frame 0000[23]0", seen.text("#voxel")
+        )
+        seen.page.select_option("#scenes", "3")
+        seen.page.wait_for_selector("#status:has-text('not as long as view.json says')")
         seen.page.close()
 
 

@@ -15,6 +15,7 @@ export const CLASS_COLORS = {
 };
 
 const SCENE_FORMAT = "raytran.scene/1";
+const MOST_NUMBERS = 16_000_000;
 const VIEW_FORMAT = "raytran.view/1";
 
 export const colorOf = (category) => CLASS_COLORS[category] ?? CLASS_COLORS.other;
@@ -40,9 +41,11 @@ export async function readScene(number) {
 }
 
 async function readVolume(base, volume) {
+  const count = volume.resolution[0] * volume.resolution[1] * volume.resolution[2];
+  if (!(count <= MOST_NUMBERS)) throw new Error("view.json tells of more voxels than a page can show");
   const [occupancy, seen] = await Promise.all([
-    volume.occupancy && readArray(base + volume.occupancy, Uint8Array),
-    volume.seen && readArray(base + volume.seen, Int16Array),
+    volume.occupancy && readArray(base + volume.occupancy, Uint8Array, count),
+    volume.seen && readArray(base + volume.seen, Int16Array, count),
   ]);
   return { ...volume, base, occupancy, seen, packed: null };
 }
@@ -125,9 +128,19 @@ async function readJson(url, needed) {
   return response.json();
 }
 
-async function readArray(url, Type) {
+/** A gzipped array of `count` numbers, or of at most MOST_NUMBERS if that is not known. */
+async function readArray(url, Type, count = null) {
   const response = await fetch(url);
   if (!response.ok) throw new Error(`cannot read ${url} (${response.status})`);
-  const plain = response.body.pipeThrough(new DecompressionStream("gzip"));
-  return new Type(await new Response(plain).arrayBuffer());
+  const most = (count ?? MOST_NUMBERS) * Type.BYTES_PER_ELEMENT;
+  const parts = [];
+  let length = 0;
+  const reader = response.body.pipeThrough(new DecompressionStream("gzip")).getReader();
+  for (let part = await reader.read(); !part.done && length <= most; part = await reader.read()) {
+    length += part.value.length;
+    parts.push(part.value);
+  }
+  if (length > most) reader.cancel();
+  if (length > most || (count !== null && length !== most)) throw new Error(`${url} is not as long as view.json says: predict again`);
+  return new Type(await new Blob(parts).arrayBuffer());
 }

@@ -111,8 +111,16 @@ function applyScore() {
   world.setScore(least);
   const { shown, found } = objects.setScore(least);
   element("count").textContent = `${shown} of ${state.data.objects.length}`;
-  if (state.data.truth) element("found").textContent = `${found} of ${state.data.truth.length} true objects found within 20 cm, 20° and 20 % of size`;
+  if (state.data.truth) element("found").textContent = sayFound(state.data.truth, found);
   refreshOverlay();
+}
+
+function sayFound(truth, found) {
+  const missed = truth.filter((_, index) => !found.has(index)).map((object) => object.category);
+  const text = `${found.size} of ${truth.length} true objects found within 20 cm, 20° and 20 % of size`;
+  if (!missed.length) return `${text}.`;
+  const counts = [...new Set(missed)].map((name) => [missed.filter((other) => other === name).length, name]);
+  return `${text}; missed: ${counts.map(([count, name]) => (count > 1 ? `${count} × ${name}` : name)).join(", ")}.`;
 }
 
 function applyVoxels() {
@@ -196,7 +204,7 @@ function describe(volume, index, reads, shares) {
   const { frame, share } = shares[0];
   const name = state.data.frames[frame].name;
   const least = volume.reads.cut > 1.5 / 255 ? `; pixels below ${Math.round(100 * volume.reads.cut)} % of its strongest are not kept` : "";
-  return `${where}It read ${reads.length} pixels of ${shares.length} frames, most of frame ${name} (${Math.round(100 * share)} %)${least}.`;
+  return `${where}It read ${reads.length} pixels of ${shares.length} ${shares.length === 1 ? "frame" : "frames"}, most of frame ${name} (${Math.round(100 * share)} %)${least}.`;
 }
 
 for (const name of LAYERS) element(`show-${name}`).addEventListener("change", applySwitches);
@@ -217,5 +225,5 @@ document.addEventListener("keydown", (event) => {
 const names = await (await fetch("scenes.json")).json();
 element("scenes-label").hidden = names.length < 2;
 element("scenes").replaceChildren(...names.map((name, number) => new Option(name, String(number))));
-globalThis.raytran = { world, state, open };
+globalThis.raytran = { world, state, open, pickVoxel: selectVoxel }; // for the console, and for tests
 await open(0);

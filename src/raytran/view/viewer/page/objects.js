@@ -30,11 +30,11 @@ export class Objects {
     this.select(null);
   }
 
-  /** Fade what is below a score; returns how many are above it and how many of these found a true object. */
+  /** Fade what is below a score; returns how many are above it and which true objects these found. */
   setScore(least) {
     const shown = this.data.objects.filter((object) => object.score >= least);
     this.data.objects.forEach((object, index) => this.rows[index].classList.toggle("weak", object.score < least));
-    return { shown: shown.length, found: shown.filter((object) => object.error?.found).length };
+    return { shown: shown.length, found: new Set(shown.filter((object) => object.error?.found).map((object) => object.error.truth)) };
   }
 
   select(index) {
