@@ -29,6 +29,8 @@ def trained(tmp_path_factory):
     settings = [
         "preset=tiny",
         "model.grid_resolution=[8,8,4]",
+        "model.backbone.num_blocks=1",
+        "views.image_size=[32,48]",
         "model.backbone.resnet.weights=/home/me/resnet.pth",
     ]
     config = compose("train", [*settings, "data.root=/home/me/rooms", f"output_dir={folder}"])
@@ -36,7 +38,8 @@ def trained(tmp_path_factory):
     parent = {"path": "/home/me/stage2/last.ckpt", "stage": "joint", "step": 3, "scores": {"val/loss": 1.0}}
     card = checkpoint_card(stage="shape", preset="tiny", config=plain(config), parent=parent)
     state = {f"model.{name}": value for name, value in model.state_dict().items()}
-    more = {"scores": {"val/objects/f1_0.25": 0.5}, "global_step": 40, "optimizer_states": [{}]}
+    scores = {"val/objects/f1_0.25": 0.5, "val/objects/f1_0.25/chair": 0.7}
+    more = {"scores": scores, "global_step": 40, "optimizer_states": [{}]}
     path = folder / "last.ckpt"
     write_checkpoint(path, {**card, **more, "state_dict": {**state, "loss.scale": torch.ones(1)}})
     return Trained(path, model)

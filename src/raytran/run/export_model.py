@@ -20,6 +20,7 @@ from raytran.run.export_program import export_program
 from raytran.run.weights import checkpoint_path, export_weights
 from raytran.training.checkpoint_file import read_checkpoint
 from raytran.training.weights_file import PREFIX, SUFFIX
+from raytran.types import CLASSES
 
 _log = logging.getLogger(__name__)
 
@@ -72,13 +73,20 @@ def described(checkpoint: Mapping[str, Any], path: Path) -> Table:
         "raytran": versions.get("raytran"),
         "commit": checkpoint.get("git_commit"),
         "torch": versions.get("torch"),
-        **(checkpoint.get("scores") or {}),
+        **{name: score for name, score in (checkpoint.get("scores") or {}).items() if _is_summary(name)},
     }
     table = Table("", "", title=str(path), show_header=False)
+    table.columns[1].overflow = "fold"
     for name, value in rows.items():
         if value is not None:
             table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
     return table
+
+
+def _is_summary(name: str) -> bool:
+    """Say whether a score is neither of one class nor of what precedes the last layer."""
+    last = name.rpartition("/")[2]
+    return last not in CLASSES and last != "proposals" and not last.startswith("layer")
 
 
 def _check_output(source: Path, output: Path) -> None:
