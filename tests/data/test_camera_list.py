@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 
 import numpy as np
 import pytest
@@ -104,6 +105,16 @@ def test_each_mistake_is_one_sentence(content, message, write):
     with pytest.raises(DataError, match=message) as refused:
         read_camera_list(write(content))
     assert "\n" not in str(refused.value)
+
+
+def test_the_lists_that_are_shown_can_be_read(project_root, write):
+    shown = re.findall(r"```json\n(.*?)```", (project_root / "docs" / "novel-view.md").read_text(), re.DOTALL)
+    first, second = (read_camera_list(write(block)) for block in shown)
+    assert first.names == ("door", "001")
+    assert [lens.size for lens in first.lenses] == [(480, 640), (600, 600)]
+    # The same camera in both forms.
+    torch.testing.assert_close(first.world_from_camera[0], second.world_from_camera[0])
+    assert first.lenses[0] == second.lenses[0]
 
 
 def test_a_missing_list(tmp_path):

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from raytran.types import Views
-from raytran.view.panels import draw_frames, draw_masks, draw_occupancy
+from raytran.view.panels import draw_frames, draw_masks, draw_new_views, draw_occupancy
 
 
 def grey_views(*levels: int) -> Views:
@@ -27,6 +27,18 @@ def test_frames_lie_in_reading_order(tmp_path):
         for column in (width // 4, 3 * width // 4)
     ]
     assert corners == pytest.approx([0, 60, 120, 180], abs=3)
+
+
+def test_new_views_lie_below_their_photographs_below_what_was_seen(tmp_path):
+    rendered = torch.tensor([0.4, 0.8])[:, None, None, None].expand(2, 3, 30, 40)
+    seen, truth = grey_views(0, 20, 40, 60), grey_views(120, 180)
+    sheet = np.asarray(Image.open(draw_new_views(tmp_path / "n.jpg", seen, truth, rendered, count=4)))
+    height, width = sheet.shape[:2]
+    middles = [
+        [sheet[(2 * row + 1) * height // 6, (2 * column + 1) * width // 4].mean() for column in (0, 1)]
+        for row in range(3)
+    ]
+    assert middles == [pytest.approx(row, abs=3) for row in ([20, 60], [120, 180], [102, 204])]
 
 
 def test_masks_are_orange_inside_and_plain_outside(tmp_path):
