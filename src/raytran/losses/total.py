@@ -74,9 +74,8 @@ class TotalLoss(nn.Module):
 
         Returns:
             ``occupancy``, ``foreground``, ``shape``, ``view``; ``objects/class``, ``objects/center``,
-            ``objects/size``, ``objects/yaw`` of the last decoder layer, ``objects/class/layer0`` and so on of
-            earlier ones, ``objects/heat/proposals`` and so on of the proposals, if the network makes any,
-            ``objects/class/copies`` and so on of noisy copies, all layers together.
+            ``objects/size``, ``objects/yaw`` of the last decoder layer, ``objects/class/layer0`` … of earlier
+            ones, ``objects/heat/proposals`` … and ``objects/class/copies`` … if the network makes any.
 
         Raises:
             ConfigError: a term is unknown, or the network was not asked for it.
