@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -158,3 +159,5 @@ def _report(output: Path, found: PredictedScene) -> None:
             found.prediction.scene_id,
         )
     _LOG.info("wrote %s: %s", output.resolve(), ", ".join(sorted(path.name for path in output.iterdir())))
+    if found.volumes is not None:
+        _LOG.info("look at it: python -m raytran.view %s", shlex.quote(str(output)))
