@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Literal
 
 import pytest
@@ -261,6 +262,14 @@ def test_decode_of_nothing_and_without_shapes() -> None:
     (prediction,) = model.decode(raw_with([0.2, 0.1]), ["scene"], with_shapes=False)
     assert len(prediction.objects) == 2
     assert prediction.objects.shape is None
+
+
+def test_what_autocast_left_in_16_bits_is_decoded_outside_of_it() -> None:
+    model, raw = make_model(), raw_with([0.9, 0.6])
+    last = raw.objects[-1]
+    short = replace(raw, objects=(replace(last, embedding=last.embedding.bfloat16()),))
+    decoded, expected = (model.decode(each, ["scene"])[0].objects.shape for each in (short, raw))
+    torch.testing.assert_close(decoded, expected, atol=0.02, rtol=0)
 
 
 def test_predict_runs_in_eval_mode_without_gradients() -> None:

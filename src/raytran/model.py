@@ -282,5 +282,7 @@ class RayTran(nn.Module):
         objects, embedding = objects_of_slots(raw.objects[-1], scene, score_threshold=score_threshold)
         if not with_shapes or "shape" not in self.heads:
             return objects
+        # What a forward pass under autocast left in 16 bits is decoded outside of it.
+        embedding = embedding.to(next(self.heads["shape"].parameters()).dtype)
         chunks = [self.decode_shapes(chunk) for chunk in embedding.split(SHAPES_AT_ONCE)]
         return replace(objects, shape=torch.cat(chunks).float().sigmoid())
