@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-fast lint format clean
+.PHONY: help install demo test test-fast lint format docs notebooks clean
 
 help:  ## Show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1|\2/' | column -t -s '|'
@@ -32,13 +32,19 @@ test-fast: install  ## Run the tests that take less than ten seconds each
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal -m 'not slow'
 
 lint: install  ## Check format, style and types
-	$(BIN)/ruff format --check src tests benchmarks
-	$(BIN)/ruff check src tests benchmarks
+	$(BIN)/ruff format --check src tests benchmarks docs notebooks
+	$(BIN)/ruff check src tests benchmarks docs notebooks
 	$(BIN)/mypy
 
 format: install  ## Rewrite the sources in the project's format
-	$(BIN)/ruff format src tests benchmarks
-	$(BIN)/ruff check --fix src tests benchmarks
+	$(BIN)/ruff format src tests benchmarks docs notebooks
+	$(BIN)/ruff check --fix src tests benchmarks docs notebooks
+
+docs: install  ## Write the tables of settings into docs/ from conf/
+	$(BIN)/python docs/options.py
+
+notebooks: install  ## Execute the notebooks and keep what they print and draw
+	OMP_NUM_THREADS=1 $(BIN)/python notebooks/execute.py
 
 clean:  ## Remove the virtual environment and caches (not data/, not outputs/)
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache dist build
