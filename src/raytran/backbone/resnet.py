@@ -50,7 +50,7 @@ class ResNet18(nn.Module):
         width: channels of the first stage; 64 is ResNet-18, the output has ``8 · width``.
         stride: image pixels along each side of a feature cell, 16 (the paper) or 8, where the third stage
             keeps its resolution too: small images then keep more cells.
-        norm_momentum: share of each batch in the running statistics that the batch norms predict with; a tenth
+        norm_momentum: share of each batch in the running statistics that batch norms predict with; a tenth
             remembers ten batches, which is few where a batch is the views of one scene.
         input_channels: 3, or 4 with a mask as input (RayTran §4). Weights for three channels are kept and
             the fourth starts at zero, so that the network begins as the pretrained one.

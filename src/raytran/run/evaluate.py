@@ -56,10 +56,7 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     check_replaceable(output.resolve(), marker=MARKER)
     settings = prediction_settings(cfg.checkpoint)
     model = load_model(cfg.checkpoint).to(choose_device(cfg.device))
-    overrides = list(HydraConfig.get().overrides.task)
-    if not any(item.startswith("preset=") for item in overrides):
-        cfg = compose("evaluate", [*overrides, f"preset={settings.preset}"])
-    cfg.split = cfg.split or "val"
+    cfg = _in_its_preset(cfg, settings)
     # The stages before it leave the shape head untrained.
     tasks = TASKS_WITH_SHAPE if settings.stage == "shape" else TASKS
     _make_data_fit(cfg, settings, model, tasks)
@@ -90,6 +87,15 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     Console().print(metrics_table(metrics, title=f"{settings.preset}, {title}"))
     _log.info("wrote %s: metrics.json, per_scene.csv, per_object.csv", output.resolve())
     return metrics
+
+
+def _in_its_preset(cfg: DictConfig, settings: PredictionSettings) -> DictConfig:
+    """Return the config in the checkpoint's preset, unless another was typed."""
+    overrides = list(HydraConfig.get().overrides.task)
+    if not any(item.startswith("preset=") for item in overrides):
+        cfg = compose("evaluate", [*overrides, f"preset={settings.preset}"])
+    cfg.split = cfg.split or "val"
+    return cfg
 
 
 def _make_data_fit(
