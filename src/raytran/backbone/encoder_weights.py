@@ -3,14 +3,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import cast
+from typing import TypeVar, cast
 
 import torch
 from torch import Tensor, nn
 
 from raytran.errors import CheckpointError
+
+_log = logging.getLogger(__name__)
+
+_T = TypeVar("_T")
+
+
+def imagenet_or_random(get: Callable[[], _T], *, required: bool) -> _T | None:
+    """Return what ``get`` returns, or None with a warning where ImageNet weights cannot be had.
+
+    Args:
+        get: fetches the weights; raises ``CheckpointError`` where it cannot.
+        required: raise that error instead.
+
+    Raises:
+        CheckpointError: the weights are required and cannot be had.
+    """
+    try:
+        return get()
+    except CheckpointError as error:
+        if required:
+            raise
+        _log.warning("the image encoder starts from random weights, which learns far slower: %s", error)
+        return None
 
 
 def read_state(path: Path, *, name: str, remedy: str) -> dict[str, Tensor]:

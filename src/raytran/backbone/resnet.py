@@ -3,17 +3,14 @@
 
 from __future__ import annotations
 
-import logging
 from pathlib import Path
 from urllib.error import URLError
 
 import torch
 from torch import Tensor, nn
 
-from raytran.backbone.encoder_weights import load_state, read_state
+from raytran.backbone.encoder_weights import imagenet_or_random, load_state, read_state
 from raytran.errors import CheckpointError, ConfigError
-
-_log = logging.getLogger(__name__)
 
 IMAGENET_URL = "https://download.pytorch.org/models/resnet18-f37072fd.pth"
 """torchvision's ``ResNet18_Weights.IMAGENET1K_V1``; the name carries the first digits of its SHA-256."""
@@ -109,14 +106,8 @@ class ResNet18(nn.Module):
 
     def _load(self, weights: str | Path) -> None:
         if weights in ("imagenet", "auto"):
-            try:
-                state = _fetch_imagenet()
-            except CheckpointError as error:
-                if weights == "imagenet":
-                    raise
-                _log.warning(
-                    "the image encoder starts from random weights, which learns far slower: %s", error
-                )
+            state = imagenet_or_random(_fetch_imagenet, required=weights == "imagenet")
+            if state is None:
                 return
         else:
             remedy = (

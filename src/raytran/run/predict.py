@@ -6,7 +6,6 @@ from __future__ import annotations
 import logging
 import shlex
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Unpack
 
@@ -36,6 +35,9 @@ _UNTRAINED = {
     "view": "it renders new views; its objects mean nothing unless stage.trainable left the backbone alone",
 }
 """Stage of the curriculum that is not the last → what to expect of its checkpoints."""
+
+_WITHOUT_SHAPES = ("occupancy", "joint")
+"""Stages before that of the shapes. The surface of their noise has a quarter of a million triangles."""
 
 RGB = 3
 """Channels of the images that a scene without annotation has."""
@@ -68,7 +70,7 @@ def predict(cfg: DictConfig) -> Path:
     scene_id = scene.stem if scene.is_file() else scene.name
     truth = read_truth(Path(cfg.truth), scene_id) if cfg.truth else None
     room = _read(cfg, world, settings, model)
-    found = _find(cfg, model, room, scene_id, with_shapes=settings.stage == "shape")
+    found = _find(cfg, model, room, scene_id, with_shapes=settings.stage not in _WITHOUT_SHAPES)
     write_scene(
         output,
         found,
@@ -114,9 +116,8 @@ def _find(
             score_threshold=cfg.score_threshold,
             duplicate_iou=cfg.duplicate_iou,
             views_at_once=cfg.views_at_once,
+            with_shapes=with_shapes,
         )
-    if not with_shapes:  # The surface of noise has a quarter of a million triangles.
-        prediction = replace(prediction, objects=replace(prediction.objects, shape=None))
     volumes = None
     if cfg.viewer:
         several = len(room.members) > 1

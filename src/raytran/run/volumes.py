@@ -44,6 +44,7 @@ class Limits(TypedDict):
     score_threshold: float
     duplicate_iou: float | None
     views_at_once: NotRequired[int | None]
+    with_shapes: NotRequired[bool]
 
 
 @dataclass(frozen=True)
@@ -151,6 +152,7 @@ def predict_volume(
     score_threshold: float,
     duplicate_iou: float | None,
     views_at_once: int | None = None,
+    with_shapes: bool = True,
     grid_center: Tensor | None = None,
 ) -> ScenePrediction:
     """Run the network on the views of one volume.
@@ -162,6 +164,7 @@ def predict_volume(
         score_threshold: objects with a lower score are left out.
         duplicate_iou: of two objects of a class with a higher box IoU, the weaker is left out; None: neither.
         views_at_once: views that pass through the network together, None for all; fewer need less memory.
+        with_shapes: decode the objects' shapes.
         grid_center: ``(3,)`` centre of the volume, metres; None: the mean camera position.
 
     Returns:
@@ -173,6 +176,7 @@ def predict_volume(
         scene_id=scene_id,
         score_threshold=score_threshold,
         views_at_once=views_at_once,
+        with_shapes=with_shapes,
         grid_center=None if grid_center is None else grid_center.to(device),
     )
     found = select_objects(raw.to("cpu"), score_threshold=score_threshold, duplicate_iou=duplicate_iou)

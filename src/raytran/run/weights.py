@@ -34,7 +34,7 @@ def checkpoint_path(checkpoint: str | Path) -> Path:
     """
     if str(checkpoint) != DEFAULT:
         return Path(checkpoint)
-    found = sorted(FOLDER.glob(f"*{SUFFIX}"))
+    found = _files()
     if len(found) != 1:
         what = f"{len(found)} files of weights, not one," if found else "no weights"
         raise CheckpointError(
@@ -46,8 +46,12 @@ def checkpoint_path(checkpoint: str | Path) -> Path:
 
 def shipped_weights() -> Path | None:
     """Return the package's own weights, None if it was built without."""
-    found = sorted(FOLDER.glob(f"*{SUFFIX}"))
+    found = _files()
     return found[0] if len(found) == 1 else None
+
+
+def _files() -> list[Path]:
+    return sorted(FOLDER.glob(f"*{SUFFIX}"))
 
 
 def export_weights(checkpoint: Mapping[str, Any], source: Path, output: Path, *, dtype: str) -> None:
