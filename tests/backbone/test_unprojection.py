@@ -133,6 +133,16 @@ def test_coarser_levels_see_further(generator: torch.Generator) -> None:
     assert reached[1] > 4
 
 
+def test_norms_over_the_voxels_remember_as_they_are_told(generator: torch.Generator) -> None:
+    network = UnprojectionBackbone(resnet=ResNet18(width=4), channels=8, num_blocks=1, norm_momentum=0.25)
+    norm = network.volume.down[0][0].bn1
+    voxels = torch.rand(1, 6, 6, 6, 8, generator=generator)
+    convolved = network.volume.down[0][0].conv1(voxels.movedim(-1, 1))
+    network.train().volume(voxels)
+    torch.testing.assert_close(norm.running_mean, 0.25 * convolved.mean(dim=(0, 2, 3, 4)))
+    assert network.resnet.bn1.momentum == 0.1, "the image encoder has its own"
+
+
 @pytest.mark.parametrize("wrong", [{"num_blocks": 0}, {"num_levels": 0}])
 def test_nothing_is_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match="a block and a level"):

@@ -28,13 +28,20 @@ class UnprojectionBackbone(LiftingBackbone):
         channels: C of the 2D and 3D representations.
         num_blocks: residual blocks at the voxels' own resolution.
         num_levels: resolutions, each half the one before; the coarser ones have one residual block each.
+        norm_momentum: as that of the image encoder, for the batch norms over the voxels.
 
     Raises:
         ConfigError: there is no block, or no level.
     """
 
     def __init__(
-        self, *, resnet: ImageEncoder, channels: int = 256, num_blocks: int = 4, num_levels: int = 3
+        self,
+        *,
+        resnet: ImageEncoder,
+        channels: int = 256,
+        num_blocks: int = 4,
+        num_levels: int = 3,
+        norm_momentum: float = 0.1,
     ) -> None:
         super().__init__(resnet=resnet, channels=channels)
         if num_blocks < 1 or num_levels < 1:
@@ -45,6 +52,9 @@ class UnprojectionBackbone(LiftingBackbone):
         self.tracer = CenterTracer()
         self.blocks = nn.ModuleList()
         self.volume = VoxelEncoderDecoder(channels=channels, num_blocks=num_blocks, num_levels=num_levels)
+        for module in self.volume.modules():
+            if isinstance(module, nn.BatchNorm3d):
+                module.momentum = norm_momentum
         self.voxel_norm = nn.LayerNorm(channels)
         self.pixel_norm = nn.LayerNorm(channels)
 
