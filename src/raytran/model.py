@@ -177,14 +177,13 @@ class RayTran(nn.Module):
         return self.heads["shape"](embedding)
 
     def idle_modules(self, tasks: Collection[str]) -> tuple[str, ...]:
-        """Return the names of the sub-modules that ``forward`` does not reach when asked for ``tasks``.
+        """Return the names of the sub-modules that no gradient reaches when ``forward`` is asked for ``tasks``.
 
-        Their parameters get no gradient, so a stage of training must freeze them; ``shape`` counts as a task.
+        So a stage of training must freeze them; ``shape`` counts as a task.
         """
         heads = tuple(f"heads.{name}" for name in self.heads if name not in tasks)
-        if "foreground" in tasks:
-            return heads
-        return heads + tuple(f"backbone.{name}" for name in self.backbone.idle_without_pixels())
+        idle = self.backbone.idle_modules(with_pixels="foreground" in tasks)
+        return heads + tuple(f"backbone.{name}" for name in idle)
 
     @torch.no_grad()
     def predict(

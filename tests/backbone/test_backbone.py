@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from raytran.backbone.backbone import Backbone
+from raytran.backbone.efficientnet import EfficientNetLite0
 from raytran.backbone.resnet import ResNet18
 from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
@@ -75,6 +76,49 @@ def test_without_pixels_the_voxels_are_the_same() -> None:
     assert full[1].shape == (1, 2, 2, 2, 8)
     assert alone[1] is None
     torch.testing.assert_close(full[0], alone[0])
+
+
+@pytest.mark.parametrize("with_pixels", [True, False])
+def test_no_gradient_reaches_a_frozen_encoder(with_pixels: bool) -> None:
+    torch.manual_seed(0)
+    encoder = EfficientNetLite0(stride=16, num_stages=4, frozen=True)
+    backbone = Backbone(resnet=encoder, channels=8, num_heads=2, num_blocks=1).requires_grad_().train()
+    idle = backbone.idle_modules(with_pixels=with_pixels)
+    assert idle[0] == "resnet"
+    for name, parameter in backbone.named_parameters():
+        parameter.requires_grad_(not name.startswith(idle))
+    voxels, pixels = backbone(torch.rand(1, 2, 3, 32, 32), **scene(), with_pixels=with_pixels)
+    ((voxels**3).sum() + (0.0 if pixels is None else (pixels**3).sum())).backward()
+    without = {name for name, parameter in backbone.named_parameters() if parameter.grad is None}
+    assert without == {name for name, _ in backbone.named_parameters() if name.startswith(idle)}
+
+
+def test_start_levels_run_before_the_first_block_and_leave_the_rest_as_it_was() -> None:
+    def make(start_levels: int) -> Backbone:
+        torch.manual_seed(0)
+        return Backbone(
+            resnet=ResNet18(width=4), channels=8, num_heads=2, num_blocks=1, start_levels=start_levels
+        ).eval()
+
+    plain, deep = make(0), make(2)
+    names = set(deep.state_dict()) - set(plain.state_dict())
+    assert names
+    assert all(name.startswith("volume.") for name in names)
+    for name, value in plain.state_dict().items():
+        assert torch.equal(value, deep.state_dict()[name]), name
+    entered: dict[str, torch.Tensor] = {}
+    for key, backbone in (("plain", plain), ("deep", deep)):
+        backbone.blocks[0].register_forward_pre_hook(
+            lambda _, inputs, key=key: entered.update({key: inputs[0].detach()})
+        )
+        backbone(torch.full((1, 2, 3, 32, 32), 0.3), **scene())
+    torch.testing.assert_close(entered["deep"], deep.volume(entered["plain"]))
+    assert not torch.allclose(entered["deep"], entered["plain"])
+
+
+def test_start_levels_are_not_negative() -> None:
+    with pytest.raises(ConfigError, match="start_levels must be 0 or more, got -1"):
+        Backbone(resnet=ResNet18(width=4), channels=8, num_heads=2, num_blocks=1, start_levels=-1)
 
 
 def test_channels_must_split_into_heads() -> None:

@@ -106,6 +106,38 @@ def test_missing_and_foreign_files(tmp_path: Path) -> None:
         EfficientNetLite0(weights=tmp_path / "foreign.pth")
 
 
+def test_fewer_stages_are_the_first_ones_of_the_trunk(tmp_path: Path) -> None:
+    whole = EfficientNetLite0(stride=8).eval()
+    path = tmp_path / "lite0.pth"
+    torch.save({f"_{name}": value for name, value in whole.state_dict().items()}, path)
+    short = EfficientNetLite0(stride=8, num_stages=5, weights=path).eval()
+    images = torch.rand(1, 3, 32, 32)
+    expected = {}
+    whole.blocks[10].register_forward_hook(lambda _, inputs, output: expected.update(features=output))
+    with torch.no_grad():
+        whole(images)
+        features = short(images)
+    assert features.shape == (1, short.out_channels, 4, 4) == (1, 112, 4, 4)
+    torch.testing.assert_close(features, expected["features"])
+
+
+@pytest.mark.parametrize(("stride", "num_stages"), [(8, 2), (16, 3), (8, 8)])
+def test_numbers_of_stages_are_checked(stride: int, num_stages: int) -> None:
+    with pytest.raises(ConfigError, match=f"num_stages must be 3 to 7, .* got {num_stages}"):
+        EfficientNetLite0(stride=stride, num_stages=num_stages)
+
+
+def test_a_frozen_network_stays_as_it_is() -> None:
+    network = EfficientNetLite0(stride=8, num_stages=3, frozen=True).train()
+    assert not any(module.training for module in network.modules())
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    features = network(torch.rand(2, 3, 32, 32))
+    assert not features.requires_grad
+    assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
+    with pytest.raises(ConfigError, match="mask"):
+        EfficientNetLite0(stride=8, frozen=True, input_channels=4)
+
+
 def test_strides_are_checked() -> None:
     with pytest.raises(ConfigError, match="8 or 16, got 32"):
         EfficientNetLite0(stride=32)

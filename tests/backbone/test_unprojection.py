@@ -10,7 +10,7 @@ from torch import Tensor
 
 from raytran.backbone.chunked import run_in_chunks
 from raytran.backbone.resnet import ResNet18
-from raytran.backbone.unprojection import UnprojectionBackbone, VoxelEncoderDecoder
+from raytran.backbone.unprojection import UnprojectionBackbone
 from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
@@ -108,29 +108,10 @@ def test_gradients_reach_all_that_is_not_idle(generator: torch.Generator, with_p
     # Squares of what a layer normalisation returns add up to the same whatever comes in.
     (voxels**3).sum().backward() if pixels is None else ((voxels**3).sum() + (pixels**3).sum()).backward()
     without = {name for name, parameter in backbone.named_parameters() if parameter.grad is None}
-    idle = () if with_pixels else backbone.idle_without_pixels()
+    idle = backbone.idle_modules(with_pixels=with_pixels)
     assert without == {name for name, _ in backbone.named_parameters() if name.startswith(idle or ("-",))}
     for name, parameter in backbone.named_parameters():
         assert name in without or parameter.grad.abs().max() > 0, name
-
-
-@pytest.mark.parametrize(("size", "num_levels"), [((7, 4, 5), 3), ((8, 8, 8), 4), ((3, 2, 2), 1)])
-def test_any_size_of_volume_comes_back(size: tuple[int, int, int], num_levels: int) -> None:
-    network = VoxelEncoderDecoder(channels=4, num_blocks=1, num_levels=num_levels).eval()
-    assert network(torch.rand(2, *size, 4)).shape == (2, *size, 4)
-
-
-def test_coarser_levels_see_further(generator: torch.Generator) -> None:
-    """Without them two convolutions reach two voxels, with them the other end of the volume."""
-    reached = []
-    for num_levels in (1, 3):
-        torch.manual_seed(0)
-        network = VoxelEncoderDecoder(channels=16, num_blocks=1, num_levels=num_levels).eval()
-        voxels = torch.rand(1, 16, 1, 1, 16, generator=generator).requires_grad_()
-        network(voxels)[0, 0].sum().backward()
-        reached.append(int(voxels.grad.abs().sum(dim=-1).flatten().nonzero().max()))
-    assert reached[0] == 2
-    assert reached[1] > 4
 
 
 def test_norms_over_the_voxels_remember_as_they_are_told(generator: torch.Generator) -> None:

@@ -9,6 +9,7 @@ from torch.utils.checkpoint import checkpoint
 
 from raytran.backbone.block import RayTracedBlock
 from raytran.backbone.lifting import ImageEncoder, LiftingBackbone
+from raytran.backbone.volume import VoxelEncoderDecoder
 from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
@@ -26,11 +27,15 @@ class Backbone(LiftingBackbone):
         num_heads: attention heads of each block.
         num_blocks: number of blocks n.
         expansion: hidden channels of the blocks' feed-forwards, as a multiple of C.
+        start_levels: resolutions of a 3D encoder-decoder that the voxels pass before the first block; 0, as in
+            the paper, for none.
+        norm_momentum: as that of the image encoder, for the batch norms of that encoder-decoder.
         checkpoint_blocks: in training keep only what enters each block and compute the rest again for the
             backward pass: the same gradients, less memory, a forward pass of the blocks more.
 
     Raises:
-        ConfigError: ``channels`` is not a multiple of ``num_heads``, or there is no block.
+        ConfigError: ``channels`` is not a multiple of ``num_heads``, there is no block, or ``start_levels`` is
+            negative.
     """
 
     def __init__(
@@ -41,6 +46,8 @@ class Backbone(LiftingBackbone):
         num_heads: int = 8,
         num_blocks: int = 4,
         expansion: int = 2,
+        start_levels: int = 0,
+        norm_momentum: float = 0.1,
         checkpoint_blocks: bool = False,
     ) -> None:
         super().__init__(resnet=resnet, channels=channels)
@@ -49,6 +56,8 @@ class Backbone(LiftingBackbone):
                 "backbone needs channels divisible by num_heads and a block at least, got "
                 f"channels={channels}, num_heads={num_heads}, num_blocks={num_blocks}"
             )
+        if start_levels < 0:
+            raise ConfigError(f"start_levels must be 0 or more, got {start_levels}")
         self.checkpoint_blocks = checkpoint_blocks
         self.voxel_position = nn.Linear(channels, channels)
         self.ray_position = nn.Sequential(nn.Linear(6, channels), nn.GELU(), nn.Linear(channels, channels))
@@ -59,6 +68,12 @@ class Backbone(LiftingBackbone):
         )
         self.voxel_norm = nn.LayerNorm(channels)
         self.pixel_norm = nn.LayerNorm(channels)
+        # Last, so that the other parts start from the same weights with and without.
+        self.volume: nn.Module = nn.Identity()
+        if start_levels:
+            self.volume = VoxelEncoderDecoder(
+                channels=channels, num_blocks=1, num_levels=start_levels, norm_momentum=norm_momentum
+            )
 
     def embed(self, images: Tensor, cameras: Cameras, grid: VoxelGrid) -> Tensor:
         """Return the pixel features that enter the first block, ``(B · N, h, w, C)``; see ``forward``."""
@@ -68,11 +83,12 @@ class Backbone(LiftingBackbone):
     def start_voxels(self, splatted: Tensor, seen: Tensor, grid: VoxelGrid) -> Tensor:
         """Return the voxel features that enter the first block; as in ``LiftingBackbone``."""
         voxels = torch.where(seen[:, None], splatted, self.unseen.to(splatted.dtype))
-        return voxels.view(-1, *grid.resolution, self.channels) + self._locate_voxels(grid)
+        return self.volume(voxels.view(-1, *grid.resolution, self.channels) + self._locate_voxels(grid))
 
-    def idle_without_pixels(self) -> tuple[str, ...]:
-        """Return the names of the sub-modules that ``forward(..., with_pixels=False)`` does not reach."""
-        return (f"blocks.{len(self.blocks) - 1}.pixel_stream", "pixel_norm")
+    def idle_modules(self, *, with_pixels: bool) -> tuple[str, ...]:
+        """Return the names of the sub-modules that no gradient of ``forward`` reaches."""
+        idle = super().idle_modules(with_pixels=with_pixels)
+        return idle if with_pixels else (*idle, f"blocks.{len(self.blocks) - 1}.pixel_stream")
 
     def _run(
         self,

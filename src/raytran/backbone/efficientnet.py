@@ -11,6 +11,7 @@ import hashlib
 from importlib.util import find_spec
 from pathlib import Path
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
@@ -34,18 +35,23 @@ _STAGES = (
 )
 """Blocks, kernel size, stride of the first block, expansion and channels of each stage."""
 
+_NUM_BLOCKS = sum(repeats for repeats, *_ in _STAGES)
 _STEM = 32
 _EPSILON, _MOMENTUM = 1e-3, 0.01
 
 
 class EfficientNetLite0(nn.Module):
-    """The trunk of EfficientNet-Lite0, without head and classifier; 320 channels come out.
+    """The trunk of EfficientNet-Lite0, without head and classifier.
 
     Stages that would halve the resolution further than ``stride`` keep it, and all later kernels are spread
     accordingly (dilation): so every weight meets what it was trained for, at more places.
 
     Args:
         stride: image pixels along each side of a feature cell, 16 or 8.
+        num_stages: stages of the trunk, of seven; the last one's channels come out: 40 after three, 80, 112,
+            192, 320 after all.
+        frozen: the weights and statistics stay as they are, also in training: pretrained features as they
+            come, at the cost of a forward pass.
         input_channels: 3, or 4 with a mask as input (RayTran §4). Weights for three channels are kept and the
             fourth starts at zero.
         weights: None (random), ``"imagenet"`` (from the installed package, hash checked), ``"auto"`` (the
@@ -53,7 +59,8 @@ class EfficientNetLite0(nn.Module):
             its names. Needed only at construction.
 
     Raises:
-        ConfigError: the stride is neither 16 nor 8.
+        ConfigError: the stride is neither 16 nor 8, ``num_stages`` is not 3 to 7 (4 to 7 for stride 16), or a
+            frozen network is to have a fourth channel.
         CheckpointError: the weights are absent, cannot be read, or do not fit.
     """
 
@@ -61,19 +68,33 @@ class EfficientNetLite0(nn.Module):
     image_std = (128 / 255, 128 / 255, 128 / 255)
 
     def __init__(
-        self, *, stride: int = 16, input_channels: int = 3, weights: str | Path | None = None
+        self,
+        *,
+        stride: int = 16,
+        num_stages: int = len(_STAGES),
+        frozen: bool = False,
+        input_channels: int = 3,
+        weights: str | Path | None = None,
     ) -> None:
         super().__init__()
         if stride not in (8, 16):
             raise ConfigError(f"efficientnet stride must be 8 or 16, got {stride}")
+        # The third stage is the first that can reach stride 8, the fourth the first to reach 16.
+        if not (3 if stride == 8 else 4) <= num_stages <= len(_STAGES):
+            raise ConfigError(
+                f"efficientnet num_stages must be 3 to 7, for stride 16 4 to 7, got {num_stages}"
+            )
+        if frozen and input_channels != 3:
+            raise ConfigError("a frozen efficientnet cannot learn what a mask as input means: set frozen=false")
         self.stride = stride
+        self.frozen = frozen
         self.input_channels = input_channels
-        self.out_channels = _STAGES[-1][-1]
+        self.out_channels = _STAGES[num_stages - 1][-1]
         self.conv_stem = SameConv2d(input_channels, _STEM, 3, stride=2)
         self.bn0 = _norm(_STEM)
         blocks: list[nn.Module] = []
         channels, reached, dilation = _STEM, 2, 1
-        for repeats, kernel, step, expansion, outputs in _STAGES:
+        for repeats, kernel, step, expansion, outputs in _STAGES[:num_stages]:
             for index in range(repeats):
                 taken = step if index == 0 and reached * step <= stride else 1
                 blocks.append(
@@ -97,9 +118,18 @@ class EfficientNetLite0(nn.Module):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
         if weights is not None:
             self._load(weights)
+        if frozen:
+            self.requires_grad_(False).eval()
+
+    def train(self, mode: bool = True) -> EfficientNetLite0:
+        """Set training mode, unless the network is frozen."""
+        return super().train(mode and not self.frozen)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Map normalised images ``(n, 3 or 4, H, W)`` to features ``(n, 320, H/stride, W/stride)``."""
+        """Map normalised images ``(n, 3 or 4, H, W)`` to features ``(n, out_channels, H/stride, W/stride)``."""
+        if self.frozen or not torch.is_grad_enabled():
+            # Half as long on CPUs; with gradients it would be half as long again.
+            images = images.contiguous(memory_format=torch.channels_last)
         x = F.relu6(self.bn0(self.conv_stem(images)))
         for block in self.blocks:
             x = block(x)
@@ -117,6 +147,8 @@ class EfficientNetLite0(nn.Module):
         # The package's names begin with underscores; head and classifier are left out.
         state = {".".join(part.lstrip("_") for part in key.split(".")): x for key, x in state.items()}
         state = {key: x for key, x in state.items() if not key.startswith(("conv_head.", "bn1.", "fc."))}
+        left_out = tuple(f"blocks.{number}." for number in range(len(self.blocks), _NUM_BLOCKS))
+        state = {key: x for key, x in state.items() if not key.startswith(left_out)}
         load_state(self, state, first="conv_stem.weight", source=path, name=name)
 
 

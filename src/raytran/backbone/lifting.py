@@ -116,9 +116,10 @@ class LiftingBackbone(nn.Module, ABC):
             grid: the voxel grids.
         """
 
-    def idle_without_pixels(self) -> tuple[str, ...]:
-        """Return the names of the sub-modules that ``forward(..., with_pixels=False)`` does not reach."""
-        return ("pixel_norm",)
+    def idle_modules(self, *, with_pixels: bool) -> tuple[str, ...]:
+        """Return the names of the sub-modules that no gradient of ``forward`` reaches."""
+        frozen = ("resnet",) if self.resnet.frozen else ()
+        return frozen if with_pixels else (*frozen, "pixel_norm")
 
     def _run(
         self,

@@ -64,6 +64,7 @@ class ResNet18(nn.Module):
 
     image_mean = (0.485, 0.456, 0.406)
     image_std = (0.229, 0.224, 0.225)
+    frozen = False
 
     def __init__(
         self,
