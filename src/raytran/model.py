@@ -177,9 +177,9 @@ class RayTran(nn.Module):
         return self.heads["shape"](embedding)
 
     def idle_modules(self, tasks: Collection[str]) -> tuple[str, ...]:
-        """Return the names of the sub-modules that no gradient reaches when ``forward`` is asked for ``tasks``.
+        """Return the names of the sub-modules that get no gradient when ``forward`` is asked for ``tasks``.
 
-        So a stage of training must freeze them; ``shape`` counts as a task.
+        A stage of training must freeze them; ``shape`` counts as a task.
         """
         heads = tuple(f"heads.{name}" for name in self.heads if name not in tasks)
         idle = self.backbone.idle_modules(with_pixels="foreground" in tasks)

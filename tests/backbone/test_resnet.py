@@ -51,7 +51,8 @@ def test_frozen_norms_train_with_what_they_predict_with_and_keep_it(generator: t
     kept = {name: value.clone() for name, value in network.named_buffers()}
     images = torch.randn(2, 3, 32, 32, generator=generator)
     features = network.train()(images)
-    assert network.training and not network.bn1.training
+    assert network.training
+    assert not network.bn1.training
     torch.testing.assert_close(features, network.eval()(images))
     features.sum().backward()
     assert network.bn1.weight.grad.abs().sum() > 0, "scale and shift still learn"

@@ -27,15 +27,16 @@ class Backbone(LiftingBackbone):
         num_heads: attention heads of each block.
         num_blocks: number of blocks n.
         expansion: hidden channels of the blocks' feed-forwards, as a multiple of C.
-        start_levels: resolutions of a 3D encoder-decoder that the voxels pass before the first block; 0, as in
-            the paper, for none.
+        start_levels: resolutions of a 3D encoder-decoder that the voxels pass before the first block; 0 for
+            none, as in the paper.
         norm_momentum: as that of the image encoder, for the batch norms of that encoder-decoder.
+        freeze_norms: the same.
         checkpoint_blocks: in training keep only what enters each block and compute the rest again for the
             backward pass: the same gradients, less memory, a forward pass of the blocks more.
 
     Raises:
-        ConfigError: ``channels`` is not a multiple of ``num_heads``, there is no block, or ``start_levels`` is
-            negative.
+        ConfigError: ``channels`` is not a multiple of ``num_heads``, there is no block, or ``start_levels``
+            is negative.
     """
 
     def __init__(
@@ -48,6 +49,7 @@ class Backbone(LiftingBackbone):
         expansion: int = 2,
         start_levels: int = 0,
         norm_momentum: float = 0.1,
+        freeze_norms: bool = False,
         checkpoint_blocks: bool = False,
     ) -> None:
         super().__init__(resnet=resnet, channels=channels)
@@ -72,7 +74,11 @@ class Backbone(LiftingBackbone):
         self.volume: nn.Module = nn.Identity()
         if start_levels:
             self.volume = VoxelEncoderDecoder(
-                channels=channels, num_blocks=1, num_levels=start_levels, norm_momentum=norm_momentum
+                channels=channels,
+                num_blocks=1,
+                num_levels=start_levels,
+                norm_momentum=norm_momentum,
+                freeze_norms=freeze_norms,
             )
 
     def embed(self, images: Tensor, cameras: Cameras, grid: VoxelGrid) -> Tensor:

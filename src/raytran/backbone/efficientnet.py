@@ -85,34 +85,14 @@ class EfficientNetLite0(nn.Module):
                 f"efficientnet num_stages must be 3 to 7, for stride 16 4 to 7, got {num_stages}"
             )
         if frozen and input_channels != 3:
-            raise ConfigError("a frozen efficientnet cannot learn what a mask as input means: set frozen=false")
+            raise ConfigError("a frozen efficientnet cannot learn what masks mean: set frozen=false")
         self.stride = stride
         self.frozen = frozen
         self.input_channels = input_channels
         self.out_channels = _STAGES[num_stages - 1][-1]
         self.conv_stem = SameConv2d(input_channels, _STEM, 3, stride=2)
         self.bn0 = _norm(_STEM)
-        blocks: list[nn.Module] = []
-        channels, reached, dilation = _STEM, 2, 1
-        for repeats, kernel, step, expansion, outputs in _STAGES[:num_stages]:
-            for index in range(repeats):
-                taken = step if index == 0 and reached * step <= stride else 1
-                blocks.append(
-                    InvertedResidual(
-                        channels,
-                        outputs,
-                        kernel=kernel,
-                        stride=taken,
-                        dilation=dilation,
-                        expansion=expansion,
-                        has_skip=(index > 0 or step == 1) and channels == outputs,
-                    )
-                )
-                reached *= taken
-                if index == 0 and taken < step:
-                    dilation *= step
-                channels = outputs
-        self.blocks = nn.ModuleList(blocks)
+        self.blocks = nn.ModuleList(_trunk(num_stages, stride))
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
@@ -126,7 +106,7 @@ class EfficientNetLite0(nn.Module):
         return super().train(mode and not self.frozen)
 
     def forward(self, images: Tensor) -> Tensor:
-        """Map normalised images ``(n, 3 or 4, H, W)`` to features ``(n, out_channels, H/stride, W/stride)``."""
+        """Map normalised images ``(n, 3 or 4, H, W)`` to ``(n, out_channels, H/stride, W/stride)``."""
         if self.frozen or not torch.is_grad_enabled():
             # Half as long on CPUs; with gradients it would be half as long again.
             images = images.contiguous(memory_format=torch.channels_last)
@@ -236,6 +216,31 @@ class SameConv2d(nn.Conv2d):
     def forward(self, x: Tensor) -> Tensor:
         """Map ``(n, C, H, W)`` to ``(n, C', H/stride, W/stride)``."""
         return super().forward(F.pad(x, [self.before, self.after, self.before, self.after]))
+
+
+def _trunk(num_stages: int, stride: int) -> list[nn.Module]:
+    """Return the blocks of the first stages; those that would reach further than ``stride`` are dilated."""
+    blocks: list[nn.Module] = []
+    channels, reached, dilation = _STEM, 2, 1
+    for repeats, kernel, step, expansion, outputs in _STAGES[:num_stages]:
+        for index in range(repeats):
+            taken = step if index == 0 and reached * step <= stride else 1
+            blocks.append(
+                InvertedResidual(
+                    channels,
+                    outputs,
+                    kernel=kernel,
+                    stride=taken,
+                    dilation=dilation,
+                    expansion=expansion,
+                    has_skip=(index > 0 or step == 1) and channels == outputs,
+                )
+            )
+            reached *= taken
+            if index == 0 and taken < step:
+                dilation *= step
+            channels = outputs
+    return blocks
 
 
 def _norm(channels: int) -> nn.BatchNorm2d:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from raytran.backbone.encoder_weights import imagenet_or_random, load_state, read_state
+from raytran.backbone.norms import keep_statistics, set_momentum
 from raytran.errors import CheckpointError, ConfigError
 
 IMAGENET_URL = "https://download.pytorch.org/models/resnet18-f37072fd.pth"
@@ -93,8 +94,7 @@ class ResNet18(nn.Module):
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
-            elif isinstance(module, nn.BatchNorm2d):
-                module.momentum = norm_momentum
+        set_momentum(self, norm_momentum)
         if weights is not None:
             if width != 64:
                 raise ConfigError(
@@ -106,9 +106,7 @@ class ResNet18(nn.Module):
         """Set training mode, but for the batch norms that are frozen."""
         super().train(mode)
         if self.freeze_norms:
-            for module in self.modules():
-                if isinstance(module, nn.BatchNorm2d):
-                    module.eval()
+            keep_statistics(self)
         return self
 
     def forward(self, images: Tensor) -> Tensor:

@@ -29,6 +29,7 @@ class UnprojectionBackbone(LiftingBackbone):
         num_blocks: residual blocks at the voxels' own resolution.
         num_levels: resolutions, each half the one before; the coarser ones have one residual block each.
         norm_momentum: as that of the image encoder, for the batch norms over the voxels.
+        freeze_norms: the same.
 
     Raises:
         ConfigError: there is no block, or no level.
@@ -42,6 +43,7 @@ class UnprojectionBackbone(LiftingBackbone):
         num_blocks: int = 4,
         num_levels: int = 3,
         norm_momentum: float = 0.1,
+        freeze_norms: bool = False,
     ) -> None:
         super().__init__(resnet=resnet, channels=channels)
         if num_blocks < 1 or num_levels < 1:
@@ -52,7 +54,11 @@ class UnprojectionBackbone(LiftingBackbone):
         self.tracer = CenterTracer()
         self.blocks = nn.ModuleList()
         self.volume = VoxelEncoderDecoder(
-            channels=channels, num_blocks=num_blocks, num_levels=num_levels, norm_momentum=norm_momentum
+            channels=channels,
+            num_blocks=num_blocks,
+            num_levels=num_levels,
+            norm_momentum=norm_momentum,
+            freeze_norms=freeze_norms,
         )
         self.voxel_norm = nn.LayerNorm(channels)
         self.pixel_norm = nn.LayerNorm(channels)

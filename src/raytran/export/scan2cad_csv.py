@@ -4,15 +4,16 @@
 from __future__ import annotations
 
 import csv
+import io
 import logging
 import math
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 
+from raytran.data.atomic import write_text
 from raytran.errors import DataError
 from raytran.types import CadAlignments
 
@@ -100,11 +101,10 @@ def write_alignments_csv(path: Path, alignments: CadAlignments) -> Path:
     """
     numbers = torch.cat([alignments.translation, alignments.quaternion, alignments.scale], dim=1).tolist()
     names = zip(alignments.catid, alignments.id_cad, strict=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    with temporary.open("w", newline="", encoding="utf-8") as file:
-        rows = ([*name, *row] for name, row in zip(names, numbers, strict=True))
-        csv.writer(file, lineterminator="\n").writerows(rows)
-    os.replace(temporary, path)
+    table = io.StringIO()
+    rows = ([*name, *row] for name, row in zip(names, numbers, strict=True))
+    csv.writer(table, lineterminator="\n").writerows(rows)
+    write_text(path, table.getvalue())
     return path
 
 

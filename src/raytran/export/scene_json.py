@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from raytran.data.atomic import write_text
 from raytran.errors import DataError
 from raytran.geometry.rotation import yaw_from_rotation
 from raytran.types import CLASSES, ObjectSet, ScenePrediction
@@ -55,9 +55,7 @@ def write_scene_json(path: Path, prediction: ScenePrediction, mesh_names: Sequen
             entry["catid_cad"], entry["id_cad"] = objects.model_id[i].split("/", 1)
         entries.append(entry)
     content = {"format": FORMAT, "scene_id": prediction.scene_id, "up": "+z", "unit": "m", "objects": entries}
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    temporary.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(temporary, path)
+    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
     return path
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +14,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
+from raytran.data.atomic import write_json
 from raytran.errors import ConfigError
 from raytran.model import RayTran
 from raytran.run.build import build_data, plain
@@ -119,9 +119,7 @@ def _data(overrides: Sequence[str], output: Path) -> SceneDataModule:
             f"{output} holds a demo with other settings: delete it or give output=ANOTHER_FOLDER"
         )
     output.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.part")
-    temporary.write_text(json.dumps(wanted, indent=1) + "\n")
-    os.replace(temporary, path)
+    write_json(path, wanted)
     return build_data(cfg)
 
 

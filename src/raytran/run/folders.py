@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -18,6 +17,7 @@ from pathlib import Path
 
 from omegaconf import OmegaConf
 
+from raytran.data.atomic import write_json
 from raytran.errors import CheckpointError, ConfigError
 from raytran.run.launched import first_ranks, name_by_time
 
@@ -79,9 +79,7 @@ def write_finished(folder: Path, *, stage: str, preset: str, experiment: str, st
     """Mark the run in ``folder`` as finished and return the mark."""
     now = datetime.now(UTC).isoformat()
     mark = Finished(stage, preset, experiment, LAST.as_posix(), steps, now)
-    partial = folder / f"{FINISHED}.part"
-    partial.write_text(json.dumps(asdict(mark), indent=2) + "\n")
-    os.replace(partial, folder / FINISHED)
+    write_json(folder / FINISHED, asdict(mark))
     return mark
 
 

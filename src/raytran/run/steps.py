@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import json
 import logging
-import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from raytran.data.atomic import write_json
 
 _log = logging.getLogger(__name__)
 
@@ -48,6 +49,4 @@ class StepTimes:
     def add(self, name: str, seconds: float, *, continues: bool = False) -> None:
         """Enter the time of a step that was measured elsewhere."""
         self.seconds[name] = seconds + (self.seconds.get(name, 0.0) if continues else 0.0)
-        temporary = self._path.with_name(f".{self._path.name}.part")
-        temporary.write_text(json.dumps(self.seconds, indent=1) + "\n")
-        os.replace(temporary, self._path)
+        write_json(self._path, self.seconds)
