@@ -85,7 +85,9 @@ class EfficientNetLite0(nn.Module):
                 f"efficientnet num_stages must be 3 to 7, for stride 16 4 to 7, got {num_stages}"
             )
         if frozen and input_channels != 3:
-            raise ConfigError("a frozen efficientnet cannot learn what masks mean: set frozen=false")
+            raise ConfigError(
+                "a frozen efficientnet cannot learn what masks mean: set model.backbone.resnet.frozen=false"
+            )
         self.stride = stride
         self.frozen = frozen
         self.input_channels = input_channels
