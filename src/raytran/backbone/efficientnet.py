@@ -110,7 +110,7 @@ class EfficientNetLite0(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         """Map normalised images ``(n, 3 or 4, H, W)`` to ``(n, out_channels, H/stride, W/stride)``."""
         if self.frozen or not torch.is_grad_enabled():
-            # Half as long on CPUs; with gradients it would be half as long again.
+            # A third less time on CPUs; but with gradients two thirds more.
             images = images.contiguous(memory_format=torch.channels_last)
         x = F.relu6(self.bn0(self.conv_stem(images)))
         for block in self.blocks:
