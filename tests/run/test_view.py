@@ -23,12 +23,20 @@ def results(tmp_path):
     return tmp_path / "results"
 
 
+@pytest.fixture
+def interruptible():
+    """Children of a shell's background job ignore Ctrl-C, and so would theirs: this one's do not."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def start(*arguments, folder):
     command = [sys.executable, "-m", "raytran.view", *arguments]
     return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
-def test_it_shows_until_it_is_interrupted_and_never_needs_torch(results):
+def test_it_shows_until_it_is_interrupted_and_never_needs_torch(results, interruptible):
     command = start(".", "port=0", "open=false", folder=results)
     line = command.stdout.readline()
     assert "2 scenes of" in line
