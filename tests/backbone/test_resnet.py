@@ -42,26 +42,6 @@ def test_stride_8_keeps_the_same_parameters() -> None:
         ResNet18(width=8, stride=4)
 
 
-def test_frozen_norms_train_with_what_they_predict_with_and_keep_it(generator: torch.Generator) -> None:
-    network = ResNet18(width=8, freeze_norms=True)
-    for module in network.modules():
-        if isinstance(module, torch.nn.BatchNorm2d):
-            module.running_mean.uniform_(-1, 1, generator=generator)
-            module.running_var.uniform_(0.5, 2, generator=generator)
-    kept = {name: value.clone() for name, value in network.named_buffers()}
-    images = torch.randn(2, 3, 32, 32, generator=generator)
-    features = network.train()(images)
-    assert network.training
-    assert not network.bn1.training
-    torch.testing.assert_close(features, network.eval()(images))
-    features.sum().backward()
-    assert network.bn1.weight.grad.abs().sum() > 0, "scale and shift still learn"
-    torch.testing.assert_close(dict(network.named_buffers()), kept, rtol=0, atol=0)
-    live = ResNet18(width=8)
-    live.load_state_dict(network.state_dict())
-    assert (live.train()(images) - network(images)).abs().max() > 0.1
-
-
 @pytest.mark.parametrize("with_classifier", [True, False])
 def test_loads_a_file_in_torchvisions_naming(tmp_path: Path, with_classifier: bool) -> None:
     source = ResNet18().eval()

@@ -30,7 +30,7 @@ class Backbone(LiftingBackbone):
         start_levels: resolutions of a 3D encoder-decoder that the voxels pass before the first block; 0 for
             none, as in the paper.
         norm_momentum: as that of the image encoder, for the batch norms of that encoder-decoder.
-        freeze_norms: the same.
+        freeze_norms: as in ``LiftingBackbone``.
         checkpoint_blocks: in training keep only what enters each block and compute the rest again for the
             backward pass: the same gradients, less memory, a forward pass of the blocks more.
 
@@ -52,7 +52,7 @@ class Backbone(LiftingBackbone):
         freeze_norms: bool = False,
         checkpoint_blocks: bool = False,
     ) -> None:
-        super().__init__(resnet=resnet, channels=channels)
+        super().__init__(resnet=resnet, channels=channels, freeze_norms=freeze_norms)
         if channels % num_heads or num_blocks < 1:
             raise ConfigError(
                 "backbone needs channels divisible by num_heads and a block at least, got "
@@ -78,7 +78,6 @@ class Backbone(LiftingBackbone):
                 num_blocks=1,
                 num_levels=start_levels,
                 norm_momentum=norm_momentum,
-                freeze_norms=freeze_norms,
             )
 
     def embed(self, images: Tensor, cameras: Cameras, grid: VoxelGrid) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from raytran.backbone.encoder_weights import imagenet_or_random, load_state, read_state
-from raytran.backbone.norms import keep_statistics, set_momentum
+from raytran.backbone.norms import set_momentum
 from raytran.errors import CheckpointError, ConfigError
 
 IMAGENET_URL = "https://download.pytorch.org/models/resnet18-f37072fd.pth"
@@ -50,8 +50,6 @@ class ResNet18(nn.Module):
             keeps its resolution too: small images then keep more cells.
         norm_momentum: share of each batch in the running statistics that batch norms predict with; a tenth
             remembers ten batches, which is few where a batch is the views of one scene.
-        freeze_norms: train with the statistics that predictions use, and leave them as they are: a network
-            that is trained on, with few scenes a step, then learns with what it predicts with.
         input_channels: 3, or 4 with a mask as input (RayTran §4). Weights for three channels are kept and
             the fourth starts at zero, so that the network begins as the pretrained one.
         weights: None (random), ``"imagenet"`` (fetched by URL, hash checked), ``"auto"`` (the same, but
@@ -73,7 +71,6 @@ class ResNet18(nn.Module):
         width: int = 64,
         stride: int = 16,
         norm_momentum: float = 0.1,
-        freeze_norms: bool = False,
         input_channels: int = 3,
         weights: str | Path | None = None,
     ) -> None:
@@ -81,7 +78,6 @@ class ResNet18(nn.Module):
         if stride not in (8, 16):
             raise ConfigError(f"resnet stride must be 8 or 16, got {stride}")
         self.stride = stride
-        self.freeze_norms = freeze_norms
         self.input_channels = input_channels
         self.out_channels = 8 * width
         self.conv1 = nn.Conv2d(input_channels, width, 7, stride=2, padding=3, bias=False)
@@ -101,13 +97,6 @@ class ResNet18(nn.Module):
                     f"pretrained weights need resnet width 64, got {width}: set weights=null or width=64"
                 )
             self._load(weights)
-
-    def train(self, mode: bool = True) -> ResNet18:
-        """Set training mode, but for the batch norms that are frozen."""
-        super().train(mode)
-        if self.freeze_norms:
-            keep_statistics(self)
-        return self
 
     def forward(self, images: Tensor) -> Tensor:
         """Map normalised images ``(n, 3 or 4, H, W)`` to features ``(n, 8 · width, H/stride, W/stride)``."""

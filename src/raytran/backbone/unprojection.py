@@ -29,7 +29,7 @@ class UnprojectionBackbone(LiftingBackbone):
         num_blocks: residual blocks at the voxels' own resolution.
         num_levels: resolutions, each half the one before; the coarser ones have one residual block each.
         norm_momentum: as that of the image encoder, for the batch norms over the voxels.
-        freeze_norms: the same.
+        freeze_norms: as in ``LiftingBackbone``.
 
     Raises:
         ConfigError: there is no block, or no level.
@@ -45,7 +45,7 @@ class UnprojectionBackbone(LiftingBackbone):
         norm_momentum: float = 0.1,
         freeze_norms: bool = False,
     ) -> None:
-        super().__init__(resnet=resnet, channels=channels)
+        super().__init__(resnet=resnet, channels=channels, freeze_norms=freeze_norms)
         if num_blocks < 1 or num_levels < 1:
             raise ConfigError(
                 "unprojection backbone needs a block and a level at least, got "
@@ -58,7 +58,6 @@ class UnprojectionBackbone(LiftingBackbone):
             num_blocks=num_blocks,
             num_levels=num_levels,
             norm_momentum=norm_momentum,
-            freeze_norms=freeze_norms,
         )
         self.voxel_norm = nn.LayerNorm(channels)
         self.pixel_norm = nn.LayerNorm(channels)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from raytran.backbone.norms import keep_statistics, set_momentum
+from raytran.backbone.norms import set_momentum
 
 
 class VoxelEncoderDecoder(nn.Module):
@@ -17,32 +17,17 @@ class VoxelEncoderDecoder(nn.Module):
         num_blocks: residual blocks of the finest level.
         num_levels: resolutions.
         norm_momentum: share of each batch in the running statistics of the batch norms.
-        freeze_norms: train with the statistics that predictions use, and leave them as they are.
     """
 
     def __init__(
-        self,
-        *,
-        channels: int,
-        num_blocks: int,
-        num_levels: int,
-        norm_momentum: float = 0.1,
-        freeze_norms: bool = False,
+        self, *, channels: int, num_blocks: int, num_levels: int, norm_momentum: float = 0.1
     ) -> None:
         super().__init__()
-        self.freeze_norms = freeze_norms
         finest = nn.Sequential(*(ResidualBlock3d(channels, stride=1) for _ in range(num_blocks)))
         coarser = (ResidualBlock3d(channels, stride=2) for _ in range(num_levels - 1))
         self.down = nn.ModuleList([finest, *coarser])
         self.up = nn.ModuleList(Upsampling(channels) for _ in range(num_levels - 1))
         set_momentum(self, norm_momentum)
-
-    def train(self, mode: bool = True) -> VoxelEncoderDecoder:
-        """Set training mode, but for the batch norms that are frozen."""
-        super().train(mode)
-        if self.freeze_norms:
-            keep_statistics(self)
-        return self
 
     def forward(self, voxels: Tensor) -> Tensor:
         """Map ``(B, X, Y, Z, C)`` to the same; any X, Y, Z."""
