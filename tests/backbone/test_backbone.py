@@ -13,6 +13,7 @@ from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.ops.pairs import PairList
+from raytran.ops.splat import splat_features
 
 
 def make_backbone(num_blocks: int = 1) -> Backbone:
@@ -76,6 +77,31 @@ def test_without_pixels_the_voxels_are_the_same() -> None:
     assert full[1].shape == (1, 2, 2, 2, 8)
     assert alone[1] is None
     torch.testing.assert_close(full[0], alone[0])
+
+
+def test_one_direction_leaves_the_pixels_as_the_encoder_made_them(generator: torch.Generator) -> None:
+    both, one = make_backbone(num_blocks=2), make_backbone(num_blocks=2)
+    one.bidirectional = False
+    images = torch.rand(1, 2, 3, 32, 32, generator=generator)
+    embedded = one.embed(images, scene()["cameras"], scene()["grid"])
+    voxels, pixels = one(images, **scene())
+    torch.testing.assert_close(pixels[0], one.pixel_norm(embedded))
+    start = one.start_voxels(*splat_features(embedded.flatten(0, 2), scene()["pairs"]), scene()["grid"])
+    before, _ = both.blocks[0](start, embedded, scene()["pairs"])
+    after, _ = both.blocks[1](before, embedded, scene()["pairs"])
+    torch.testing.assert_close(voxels, both.voxel_norm(after))
+    assert not torch.allclose(voxels, both(images, **scene())[0], atol=1e-3)
+
+
+@pytest.mark.parametrize("with_pixels", [True, False])
+def test_no_gradient_reaches_what_one_direction_leaves_out(with_pixels: bool) -> None:
+    backbone = make_backbone(num_blocks=2).train()
+    backbone.bidirectional = False
+    voxels, pixels = backbone(torch.rand(1, 2, 3, 32, 32), **scene(), with_pixels=with_pixels)
+    ((voxels**3).sum() + (0.0 if pixels is None else (pixels**3).sum())).backward()
+    without = {name for name, parameter in backbone.named_parameters() if parameter.grad is None}
+    idle = backbone.idle_modules(with_pixels=with_pixels)
+    assert without == {name for name, _ in backbone.named_parameters() if name.startswith(idle)}
 
 
 @pytest.mark.parametrize("with_pixels", [True, False])

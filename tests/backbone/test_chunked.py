@@ -39,11 +39,13 @@ def scene(scenes: int, views: int, generator: torch.Generator) -> dict[str, Any]
     }
 
 
+@pytest.mark.parametrize("bidirectional", [True, False])
 @pytest.mark.parametrize(("scenes", "views", "views_at_once"), [(1, 5, 2), (2, 3, 1), (1, 2, 2), (1, 1, 7)])
 def test_chunks_give_what_all_views_give(
-    scenes: int, views: int, views_at_once: int, generator: torch.Generator
+    scenes: int, views: int, views_at_once: int, bidirectional: bool, generator: torch.Generator
 ) -> None:
     backbone, inputs = make_backbone(), scene(scenes, views, generator)
+    backbone.bidirectional = bidirectional
 
     def trace(cameras: Cameras) -> PairList:
         return trace_pairs(cameras, inputs["grid"], (2, 3))

@@ -27,6 +27,7 @@ class Backbone(LiftingBackbone):
         num_heads: attention heads of each block.
         num_blocks: number of blocks n.
         expansion: hidden channels of the blocks' feed-forwards, as a multiple of C.
+        bidirectional: False leaves out 3D→2D: no block changes the pixels.
         start_levels: resolutions of a 3D encoder-decoder that the voxels pass before the first block; 0 for
             none, as in the paper.
         norm_momentum: as that of the image encoder, for the batch norms of that encoder-decoder.
@@ -47,6 +48,7 @@ class Backbone(LiftingBackbone):
         num_heads: int = 8,
         num_blocks: int = 4,
         expansion: int = 2,
+        bidirectional: bool = True,
         start_levels: int = 0,
         norm_momentum: float = 0.1,
         freeze_norms: bool = False,
@@ -60,6 +62,7 @@ class Backbone(LiftingBackbone):
             )
         if start_levels < 0:
             raise ConfigError(f"start_levels must be 0 or more, got {start_levels}")
+        self.bidirectional = bidirectional
         self.checkpoint_blocks = checkpoint_blocks
         self.voxel_position = nn.Linear(channels, channels)
         self.ray_position = nn.Sequential(nn.Linear(6, channels), nn.GELU(), nn.Linear(channels, channels))
@@ -93,7 +96,12 @@ class Backbone(LiftingBackbone):
     def idle_modules(self, *, with_pixels: bool) -> tuple[str, ...]:
         """Return the names of the sub-modules that no gradient of ``forward`` reaches."""
         idle = super().idle_modules(with_pixels=with_pixels)
-        return idle if with_pixels else (*idle, f"blocks.{len(self.blocks) - 1}.pixel_stream")
+        still = [i for i in range(len(self.blocks)) if not self.updates_pixels(i, with_pixels=with_pixels)]
+        return (*idle, *(f"blocks.{index}.pixel_stream" for index in still))
+
+    def updates_pixels(self, index: int, *, with_pixels: bool) -> bool:
+        """As in ``LiftingBackbone``; never if the blocks are not bidirectional."""
+        return self.bidirectional and super().updates_pixels(index, with_pixels=with_pixels)
 
     def _run(
         self,

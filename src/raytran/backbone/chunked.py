@@ -67,7 +67,7 @@ def run_in_chunks(
     views = [images[:, chunk] for chunk in chunks]
     voxels, pixels = _start(backbone, views, cameras_of, grid, trace)
     for index, block in enumerate(backbone.blocks):
-        update_pixels = with_pixels or index + 1 < len(backbone.blocks)
+        update_pixels = backbone.updates_pixels(index, with_pixels=with_pixels)
         voxels = _run_block(
             cast("RayTracedBlock", block), voxels, pixels, cameras_of, trace, update_pixels=update_pixels
         )

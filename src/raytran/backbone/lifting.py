@@ -98,7 +98,7 @@ class LiftingBackbone(nn.Module, ABC):
         pixels = self.embed(images, cameras, grid)
         voxels = self.start_voxels(*splat_features(pixels.flatten(0, 2), pairs), grid)
         for index, block in enumerate(self.blocks):
-            update_pixels = with_pixels or index + 1 < len(self.blocks)
+            update_pixels = self.updates_pixels(index, with_pixels=with_pixels)
             voxels, pixels = self._run(block, voxels, pixels, pairs, update_pixels)
         if not with_pixels:
             return self.voxel_norm(voxels), None
@@ -126,6 +126,10 @@ class LiftingBackbone(nn.Module, ABC):
             seen: ``(B · X · Y · Z,)`` bool, whether there is any.
             grid: the voxel grids.
         """
+
+    def updates_pixels(self, index: int, *, with_pixels: bool) -> bool:
+        """Say whether block ``index`` changes the pixels: of the last one only pixel features need it."""
+        return with_pixels or index + 1 < len(self.blocks)
 
     def idle_modules(self, *, with_pixels: bool) -> tuple[str, ...]:
         """Return the names of the sub-modules that no gradient of ``forward`` reaches."""

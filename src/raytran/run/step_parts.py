@@ -81,7 +81,7 @@ def step_parts(
     ]
     if backbone.blocks:
         block, blocks = cast("RayTracedBlock", backbone.blocks[0]), len(backbone.blocks)
-        to_pixels = blocks - (not with_pixels)
+        to_pixels = sum(backbone.updates_pixels(i, with_pixels=with_pixels) for i in range(blocks))
         parts += _stream_parts("pixels → voxels", blocks, block.voxel_stream, voxels, pixels, pairs)
         parts += _stream_parts("voxels → pixels", to_pixels, block.pixel_stream, pixels, voxels, pairs)
     else:
