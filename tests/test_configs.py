@@ -171,7 +171,7 @@ def test_the_baseline_has_the_presets_sizes(preset, chosen):
         "raytran.backbone.backbone.Backbone",
     ]
     assert baseline["backbone"].pop("num_levels") == 3
-    for of_attention in ("num_heads", "expansion", "start_levels", "checkpoint_blocks"):
+    for of_attention in ("num_heads", "expansion", "bidirectional", "start_levels", "checkpoint_blocks"):
         del network["backbone"][of_attention]
     assert baseline == network
 
