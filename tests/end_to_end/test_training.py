@@ -152,6 +152,19 @@ def test_init_from_auto_takes_the_newest_parent(settings, trained, tmp_path):
     assert torch.load(child.checkpoint, weights_only=True)["parent"]["path"] == str(parent.checkpoint)
 
 
+def test_one_stage_1_does_for_another_object_head(settings, trained, tmp_path, caplog):
+    other = [
+        "experiment=stage2",
+        f"init_from={trained[1][0].checkpoint}",
+        "model.heads.objects.queries=proposal",
+    ]
+    with caplog.at_level("INFO", "raytran"):
+        child = fit(settings, tmp_path / "run", *other)
+    assert "heads.objects starts at random" in caplog.text
+    with pytest.raises(CheckpointError, match="do not fit this model"):
+        fit(settings, tmp_path / "next", "experiment=stage3", f"init_from={child.checkpoint}")
+
+
 def test_a_missing_parent_is_one_sentence(settings, tmp_path):
     with pytest.raises(CheckpointError, match=r"no checkpoint at .*none\.ckpt"):
         fit(settings, tmp_path / "run", "experiment=stage2", f"init_from={tmp_path / 'none.ckpt'}")

@@ -123,7 +123,7 @@ def load_weights(
     path: Path,
     *,
     assign: bool = False,
-    begins: Sequence[str] = (),
+    afresh: Sequence[str] = (),
 ) -> None:
     """Fill ``model`` with the weights of a checkpoint.
 
@@ -132,18 +132,14 @@ def load_weights(
         checkpoint: what ``read_checkpoint`` returned.
         path: where from, for messages.
         assign: take the checkpoint's tensors themselves, instead of copying into those of ``model``.
-        begins: parts that keep the weights they have if the checkpoint has none of theirs.
+        afresh: parts that keep the weights they have, see ``parts_afresh``.
 
     Raises:
         CheckpointError: names or shapes differ.
     """
-    state = {
-        name.removeprefix(PREFIX): value
-        for name, value in checkpoint["state_dict"].items()
-        if name.startswith(PREFIX)
-    }
-    fresh = [f"{part}." for part in begins if not any(name.startswith(f"{part}.") for name in state)]
-    state |= {name: value for name, value in model.state_dict().items() if name.startswith(tuple(fresh))}
+    kept = tuple(f"{part}." for part in afresh)
+    state = {name: value for name, value in _state(checkpoint).items() if not name.startswith(kept)}
+    state |= {name: value for name, value in model.state_dict().items() if name.startswith(kept)}
     try:
         model.load_state_dict(state, assign=assign)
     except RuntimeError as error:
@@ -152,3 +148,47 @@ def load_weights(
             f"the weights in {path} (preset {checkpoint['preset']}) do not fit this model ({reason}): "
             "choose the preset and model settings that the checkpoint was trained with"
         ) from error
+
+
+def parts_afresh(model: RayTran, checkpoint: Mapping[str, Any], begins: Sequence[str]) -> list[str]:
+    """Return the parts of ``model`` that a stage starts at random although it has a parent.
+
+    Those are the parts in ``begins`` of which the checkpoint has nothing, and the heads that are of another
+    form than the checkpoint's, if those are as random: it has no parent, and its stage did not train them.
+    So one stage 1 does for all object heads.
+
+    Args:
+        model: the network.
+        checkpoint: what ``read_checkpoint`` returned.
+        begins: parts that may be missing from the checkpoint.
+    """
+    state = {name: value.shape for name, value in _state(checkpoint).items()}
+    wanted = {name: value.shape for name, value in model.state_dict().items()}
+
+    def within(part: str, shapes: dict[str, torch.Size]) -> dict[str, torch.Size]:
+        return {name: shape for name, shape in shapes.items() if name.startswith(f"{part}.")}
+
+    missing = [part for part in begins if not within(part, state)]
+    heads = [f"heads.{head}" for head in model.heads]
+    other = [head for head in heads if within(head, state) not in ({}, within(head, wanted))]
+    return missing + [head for head in other if _is_random(head, checkpoint)]
+
+
+def _is_random(part: str, checkpoint: Mapping[str, Any]) -> bool:
+    """Say whether ``part`` of a checkpoint was never trained, as far as the checkpoint tells."""
+    try:
+        if checkpoint["parent"] is not None:
+            return False
+        trained = [f"{name}." for name in checkpoint["config"]["stage"]["trainable"]]
+    except (KeyError, TypeError):
+        return False
+    return not any(name.startswith(f"{part}.") or f"{part}.".startswith(name) for name in trained)
+
+
+def _state(checkpoint: Mapping[str, Any]) -> dict[str, torch.Tensor]:
+    """Return the network's weights in a checkpoint by their names in the network."""
+    return {
+        name.removeprefix(PREFIX): value
+        for name, value in checkpoint["state_dict"].items()
+        if name.startswith(PREFIX)
+    }

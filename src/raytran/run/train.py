@@ -19,7 +19,7 @@ from omegaconf import DictConfig, OmegaConf
 from raytran.data.atomic import write_json, write_text
 from raytran.errors import CheckpointError, ConfigError
 from raytran.run.build import build_data, build_model, build_module, build_trainer, plain
-from raytran.run.checkpoint import checkpoint_card, load_weights
+from raytran.run.checkpoint import checkpoint_card, load_weights, parts_afresh
 from raytran.run.folders import LAST, one_at_a_time, read_finished, write_finished
 from raytran.run.memory import explained_out_of_memory
 from raytran.run.parent import Parent, check_parent, find_parent
@@ -150,7 +150,10 @@ def _start(cfg: DictConfig, run: RunConfig) -> tuple[Reconstruction, Path | None
     parent = Parent.of(start, content)
     check_parent(parent, stage, run.check_parent)
     module = build_module(cfg, build_model(cfg, pretrained=False))
-    load_weights(module.model, content, start, begins=module.stage.begins)
+    afresh = parts_afresh(module.model, content, stage.begins)
+    for part in afresh:
+        _log.info("%s starts at random: its parent has none that fits, and trained none", part)
+    load_weights(module.model, content, start, afresh=afresh)
     return module, None, parent.as_plain()
 
 
