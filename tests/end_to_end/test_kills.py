@@ -19,9 +19,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from raytran.run.entry import compose
 from raytran.run.folders import FINISHED, LAST
-from raytran.run.train import train
 from raytran.training.checkpoint_file import read_newest
 
 pytestmark = pytest.mark.slow
@@ -115,7 +113,7 @@ def last_step(folder):
 def test_killed_and_resumed_is_not_killed(base, tmp_path):
     arguments = [*base, "trainer=cpu", f"trainer.max_steps={40 + 20 * KILLS}"]
     straight, folder = tmp_path / "straight", tmp_path / "killed"
-    train(compose("train", [*arguments, f"output_dir={straight}"]))
+    finish("train", straight, *arguments)  # like the others: as many threads, so the same bits
     moments, steps = random.Random(0), []
     for _ in range(KILLS):
         process = start("train", folder, *arguments)

@@ -134,7 +134,7 @@ def test_a_head_of_another_form_starts_at_random_if_that_of_the_parent_is_random
         [
             "preset=tiny",
             "model.grid_resolution=[8,8,4]",
-            "model.heads.objects.num_queries=9",
+            "model.heads.objects.queries=learned",
             "output_dir=unused",
         ],
     )

@@ -41,9 +41,13 @@ def history(module, batch, precision):
 
 @pytest.mark.parametrize("experiment", ["stage1", "stage2", "stage3"])
 def test_sixteen_bits_train_like_thirty_two(experiment, batch, make_module):
-    """Over 15 steps no loss is off by more than 2 % of what it falls by (measured: 0.3 %)."""
-    exact, exact_scores = history(make_module(experiment), batch, "32-true")
-    short, short_scores = history(make_module(experiment), batch, "bf16-mixed")
+    """Over 15 steps no loss is off by more than 2 % of what it falls by (measured: 0.3 %).
+
+    With learned queries: which voxels are proposed hangs on rounding as long as nothing is learned.
+    """
+    learned = "model.heads.objects.queries=learned"
+    exact, exact_scores = history(make_module(experiment, learned), batch, "32-true")
+    short, short_scores = history(make_module(experiment, learned), batch, "bf16-mixed")
     fall = exact[0] - exact[-1]
     assert fall > 0
     assert short != exact

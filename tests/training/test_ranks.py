@@ -133,7 +133,8 @@ def test_two_ranks_and_an_empty_scene_take_the_step_of_one_rank(scenes, two_rank
         for name, value in one["weights"].items():
             first, second = (rank[stage]["weights"][name] for rank in two_ranks)
             assert torch.equal(first, second), name
-            assert torch.allclose(first, value, rtol=0, atol=1e-10), (stage, name)
+            # Proposals and poses leave their layers as float32; measured: 1.1e-9 (learning rate 1e-3).
+            assert torch.allclose(first, value, rtol=0, atol=1e-8), (stage, name)
     norm = nn.BatchNorm2d(3)
     images = torch.randn(2, 3, 4, 5, generator=torch.Generator().manual_seed(0))
     # Each rank weighs its outputs anew from the start: one process has to do the same.

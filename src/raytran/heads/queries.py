@@ -125,7 +125,7 @@ class ProposalQueries(nn.Module):
     def _propose(self, voxels: Tensor, grid: VoxelGrid) -> tuple[RawProposals, Tensor]:
         """Return the guesses of all voxels and the features ``(B, X, Y, Z, C)`` they are read from."""
         features = self.norm(F.gelu(self.convolution(voxels.movedim(-1, 1)).movedim(1, -1)))
-        anchor = grid.voxel_centers().float()
+        anchor = grid.voxel_centers().to(self.pose.weight.dtype)
         offset, log_size, yaw_vector = self.pose(features).float().split([3, 3, 2], dim=-1)
         logits = self.category(features).float()
         return RawProposals(anchor, logits, anchor + offset, log_size, yaw_vector), features
