@@ -28,7 +28,6 @@ def main() -> None:
     for views in arguments.views:
         cameras = cameras_of(arguments, views, device)
         grid = paper_grid(cameras)
-        # As in training: room for the pairs is known from the step before, and the host waits for nothing.
         tracers = {
             f"{n}×{n} rays a cell": partial(RayTracer(), cameras, grid, FEATURE_SIZE, n) for n in (1, 2)
         }

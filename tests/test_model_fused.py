@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole network on the fused kernels, in Triton's interpreter, against products of torch.sparse."""
+"""The whole network on the fused kernels, on a GPU or in Triton's interpreter, against torch.sparse."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from raytran.backbone.resnet import ResNet18
 from raytran.heads.foreground import ForegroundHead
 from raytran.heads.occupancy import OccupancyHead
 from raytran.model import RayTran
-from raytran.ops import block_pairs, ray_tracer
+from raytran.ops import block_pairs
 from raytran.ops.block_pairs import BlockPairs
+from raytran.ops.ray_tracer import RayTracer
 from raytran.types import RawScene, Views
 
 pytest.importorskip("triton", reason="Triton is not installed: the fused kernels have nothing to run on")
-if torch.cuda.is_available():
-    pytest.skip("on a GPU the network runs on the fused kernels anyway", allow_module_level=True)
 
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 TASKS = ("occupancy", "foreground")
 
 
-def _model() -> RayTran:
+def _model(attention: str = "sparse") -> RayTran:
     torch.manual_seed(0)
     backbone = Backbone(
-        resnet=ResNet18(width=4, input_channels=3), channels=16, num_heads=1, num_blocks=1, expansion=1
+        resnet=ResNet18(width=8, input_channels=3), channels=16, num_heads=1, num_blocks=1, expansion=1
     )
     heads = {
         "occupancy": OccupancyHead(channels=16),
@@ -37,7 +37,8 @@ def _model() -> RayTran:
         grid_resolution=(5, 5, 3),
         grid_extent=(4.0, 4.0, 2.0),
         rays_per_cell=1,
-    )
+        attention=attention,
+    ).to(DEVICE)
 
 
 def _views() -> Views:
@@ -46,7 +47,7 @@ def _views() -> Views:
     pose[..., :3, 3] = torch.tensor([[0.1, 0.2, 0.0], [-0.3, -0.4, 0.1]])
     intrinsics = torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]).expand(1, 2, 3, 3)
     images = torch.rand(1, 2, 3, 32, 48, generator=torch.Generator().manual_seed(1))
-    return Views(images, intrinsics, pose)
+    return Views(images, intrinsics, pose).to(DEVICE)
 
 
 @pytest.fixture(autouse=True)
@@ -63,9 +64,8 @@ def test_equals_the_network_on_torch_sparse(monkeypatch):
     model, views = _model(), _views()
     expected = model(views, tasks=TASKS)
     gradients = torch.autograd.grad(_loss(expected), list(model.parameters()), allow_unused=True)
-    monkeypatch.setattr(ray_tracer, "has_kernels", lambda device: True)
     traced = []
-    tracer = model.ray_tracer
+    tracer = RayTracer("fused")
 
     def trace(*arguments):
         traced.append(tracer(*arguments))
@@ -86,9 +86,8 @@ def test_equals_the_network_on_torch_sparse(monkeypatch):
             torch.testing.assert_close(mine, theirs, atol=1e-5, rtol=1e-3)
 
 
-def test_prediction_in_chunks_of_views(monkeypatch):
-    model, views = _model().eval(), _views()
-    monkeypatch.setattr(ray_tracer, "has_kernels", lambda device: True)
+def test_prediction_in_chunks_of_views():
+    model, views = _model("fused").eval(), _views()
     with torch.no_grad():
         whole, chunked = model(views, tasks=TASKS), model(views, tasks=TASKS, views_at_once=1)
     torch.testing.assert_close(chunked.occupancy, whole.occupancy, atol=1e-5, rtol=1e-4)

@@ -23,6 +23,7 @@ from raytran.geometry.grid import VoxelGrid
 from raytran.heads.objects import ObjectHead
 from raytran.heads.slots import objects_of_slots
 from raytran.ops.block_pairs import BlockPairs
+from raytran.ops.fused import Attention
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_tracer import RayTracer
 from raytran.ops.traverse import count_views
@@ -53,9 +54,12 @@ class RayTran(nn.Module):
         grid_resolution: ``(X, Y, Z)`` voxels.
         grid_extent: sizes of the voxel grid, metres.
         rays_per_cell: n×n rays join a cell of the feature map with the voxels they cross.
+        attention: what computes ray-traced attention: ``fused`` Triton kernels, products of ``torch.sparse``
+            (``sparse``), or the former where they run and the latter elsewhere (``auto``).
 
     Raises:
-        ConfigError: the foreground or view head does not grow the features back to image size.
+        ConfigError: the foreground or view head does not grow the features back to image size, or there is no
+            such attention.
     """
 
     def __init__(
@@ -66,6 +70,7 @@ class RayTran(nn.Module):
         grid_resolution: Sequence[int] = (48, 48, 16),
         grid_extent: Sequence[float] = (9.0, 9.0, 3.5),
         rays_per_cell: int = 2,
+        attention: Attention = "auto",
     ) -> None:
         super().__init__()
         for name in ("foreground", "view"):
@@ -79,7 +84,7 @@ class RayTran(nn.Module):
         self.grid_resolution = (int(grid_resolution[0]), int(grid_resolution[1]), int(grid_resolution[2]))
         self.grid_extent = (float(grid_extent[0]), float(grid_extent[1]), float(grid_extent[2]))
         self.rays_per_cell = rays_per_cell
-        self.ray_tracer = RayTracer()
+        self.ray_tracer = RayTracer(attention)
 
     def forward(
         self,

@@ -17,6 +17,7 @@ import torch
 
 import raytran
 from raytran.errors import CheckpointError, ConfigError
+from raytran.ops import block_pairs
 from raytran.run.curriculum import run_curriculum
 from raytran.run.entry import compose
 from raytran.run.folders import LAST, read_finished
@@ -128,6 +129,51 @@ def test_resume_continues_in_the_same_folder(settings, tmp_path):
     content = torch.load(resumed.checkpoint, weights_only=True)
     assert content["lr_schedulers"][0]["last_epoch"] == 6
     assert next(iter(content["optimizer_states"][0]["state"].values()))["step"] == 6
+
+
+@pytest.mark.slow
+def test_attention_is_computed_as_the_run_says(settings, tmp_path, monkeypatch):
+    """Fused in Triton's interpreter, which rounds otherwise, and by torch.sparse: nearly the same loss."""
+    pytest.importorskip("triton", reason="Triton is not installed: there are no fused kernels")
+    monkeypatch.setattr(block_pairs, "_SLOTS", 16)
+    more = [
+        "experiment=stage1",
+        "trainer.max_steps=1",
+        "trainer.val_check_interval=1",
+        "model.rays_per_cell=1",
+    ]
+    fits = {
+        name: fit(settings, tmp_path / name, *more, f"model.attention={name}") for name in ("fused", "sparse")
+    }
+    fused, sparse = (found.metrics["train/total"] for found in fits.values())
+    assert fused == pytest.approx(sparse, rel=1e-5)
+    assert not set(torch.load(fits["fused"].checkpoint, weights_only=True)["state_dict"]) <= same_weights(
+        *(found.checkpoint for found in fits.values())
+    )
+    assert raytran.load(fits["fused"].checkpoint).ray_tracer.attention == "auto"
+
+
+def test_fused_attention_without_a_gpu_is_one_sentence(
+    settings, trained, rooms, tmp_path, command, monkeypatch
+):
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    scan = rooms / "scannet" / "scans" / "scene0000_00"
+    runs = [
+        command("train", *settings, "experiment=stage1", "model.attention=fused", folder=tmp_path),
+        command(
+            "predict",
+            f"checkpoint={trained[1][-1].checkpoint}",
+            f"scene={scan}",
+            "output=prediction",
+            "device=cpu",
+            "attention=fused",
+            folder=tmp_path,
+        ),
+    ]
+    for result in runs:
+        assert result.returncode == 1
+        assert "attention=fused needs a GPU with Triton, but tensors are on the CPU" in result.stderr
+        assert "Traceback" not in result.stderr
 
 
 def test_a_run_is_not_overwritten(settings, trained):

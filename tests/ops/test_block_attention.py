@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -201,3 +203,39 @@ def test_autocast_changes_nothing(shaped_pairs, generator):
     expected = ray_attention(*inputs, blocks)
     with torch.autocast(DEVICE, dtype=torch.bfloat16):
         assert torch.equal(ray_attention(*inputs, blocks), expected)
+
+
+def test_tuples_of_the_kernels_hold_tensors_alone(random_pairs, generator):
+    """A number in one that is 1 is a constant, which Triton before 3.8 loses on its way to a function."""
+    from raytran.ops.block_attention import Launch, layout_of, tensors_of
+
+    blocks = random_pairs(9, 14, 0.4).blocks()
+    query, key, _ = _inputs(random_pairs(9, 14, 0.4), "pixels_to_voxels", 1, 16, generator)
+    layouts = layout_of(blocks.voxels), layout_of(blocks.pixels)
+    launch = Launch(query, key, tensors_of(blocks.by("voxels")), *layouts)
+    tensors, *sizes = launch.arguments(blocks.masks)
+    assert all(isinstance(tensor, Tensor) for tensor in tensors)
+    assert sizes[:3] == [14, 9, 1]
+
+
+@pytest.mark.parametrize(
+    ("dtype", "channels"), [(torch.float32, 128), (torch.bfloat16, 256), (torch.float64, 8)]
+)
+def test_heads_that_do_not_fit_a_gpu_are_left_to_torch_sparse(random_pairs, generator, dtype, channels):
+    from raytran.ops.fused import fused_blocks
+
+    pairs = random_pairs(9, 14, 0.4)
+    assert fused_blocks(pairs.blocks(), torch.device(DEVICE), dtype, channels) is None
+    inputs = _inputs(pairs, "pixels_to_voxels", 1, channels, generator, dtype)
+    assert torch.equal(
+        ray_attention(*inputs, pairs.blocks().to(DEVICE)), ray_attention(*inputs, pairs.to(DEVICE))
+    )
+
+
+def test_pairs_that_ask_for_torch_sparse_get_it(random_pairs):
+    from raytran.ops.fused import fused_blocks
+
+    pairs = random_pairs(9, 14, 0.4)
+    for device in ("cpu", "cuda"):
+        assert fused_blocks(replace(pairs, fused=False), torch.device(device), torch.float32, 8) is None
+    assert fused_blocks(pairs, torch.device("cuda"), torch.float32, 8) is not None

@@ -3,16 +3,13 @@
 
 from __future__ import annotations
 
-import copy
-import pickle
-
 import pytest
 import torch
 
-from raytran.errors import ShapeError
+from raytran.errors import ConfigError, ShapeError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.ops import ray_tracer
+from raytran.ops.block_pairs import BlockPairs
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_tracer import RayTracer
 from raytran.ops.traverse import trace_pairs
@@ -113,30 +110,39 @@ def test_room_for_fewer_or_more_block_pairs_than_there_are(random_cameras, room)
         assert torch.equal(blocks.pixels_per_voxel(), exact.pixels_per_voxel())
 
 
-def test_tracer_makes_room_by_what_it_has_met_and_says_what_it_left_out(random_cameras, monkeypatch, caplog):
-    monkeypatch.setattr(ray_tracer, "has_kernels", lambda device: True)
-    monkeypatch.setattr(ray_tracer, "_ROOM_STEP", 1)
-    cameras, center = random_cameras(1, spread=0.1), torch.zeros(3, dtype=torch.float64)
-    few = _on_device(cameras, VoxelGrid((4, 4, 4), (3.0, 3.0, 3.0), center))  # one block
-    many = _on_device(cameras, VoxelGrid((16, 16, 8), (3.0, 3.0, 3.0), center))
-    tracer = RayTracer(headroom=1.5)
-    first = tracer(*few, (4, 16), 1)  # exact
-    second = tracer(*many, (4, 16), 1)
-    assert len(second) == int(1.5 * len(first)) < len(trace_blocks(*many, (4, 16), 1)[0])
-    with caplog.at_level("WARNING"):
-        third = tracer(*many, (4, 16), 1)
-    exact, _ = trace_blocks(*many, (4, 16), 1)
-    assert (
-        caplog.records[0]
-        .getMessage()
-        .startswith(f"{len(exact) - len(second)} of {len(exact)} block pairs had no room")
+@pytest.mark.parametrize("attention", ["auto", "fused", "sparse"])
+def test_tracer_gives_pairs_for_the_attention_that_is_asked_for(random_cameras, attention):
+    here = _on_device(random_cameras(2, spread=0.5), VoxelGrid((6, 5, 4), (3.0, 2.0, 2.0), torch.zeros(3)))
+    pairs = RayTracer(attention)(*here, (4, 8), 1)
+    exact = trace_pairs(*here, (4, 8), 1)
+    fused = attention == "fused" or (attention == "auto" and DEVICE == "cuda")
+    assert isinstance(pairs, BlockPairs if fused else PairList)
+    assert torch.equal(
+        torch.stack(pairs.index() if fused else (pairs.pixel_index, pairs.voxel_index)),
+        torch.stack([exact.pixel_index, exact.voxel_index]),
     )
-    assert len(third) == int(1.5 * len(exact))
-    assert torch.equal(third.key[: len(exact)], exact.key)
-    with torch.no_grad():
-        assert len(tracer(*few, (4, 16), 1)) == len(first)  # exact again
-    assert len(caplog.records) == 1
-    assert len(pickle.loads(pickle.dumps(copy.deepcopy(tracer)))(*many, (4, 16), 1)) == len(third)
+    if not fused:
+        assert pairs.fused == (attention == "auto")
+
+
+def test_every_pair_is_there_however_many_the_step_before_had(random_cameras):
+    tracer, center = RayTracer("fused"), torch.zeros(3, dtype=torch.float64)
+    cameras = random_cameras(1, spread=0.1)
+    for side in (4, 16):  # one block, then many
+        here = _on_device(cameras, VoxelGrid((side, side, side), (3.0, 3.0, 3.0), center))
+        exact = trace_pairs(*here, (4, 16), 1)
+        assert len(tracer(*here, (4, 16), 1).index()[0]) == len(exact)
+
+
+def test_fused_attention_that_cannot_run_is_refused(random_cameras, monkeypatch):
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    grid = VoxelGrid((3, 2, 2), (3.0, 2.0, 2.0), torch.zeros(3))
+    with pytest.raises(
+        ConfigError, match="attention=fused needs a GPU with Triton, but tensors are on the CPU"
+    ):
+        RayTracer("fused")(random_cameras(2, spread=0.5), grid, (3, 4), 1)
+    with pytest.raises(ConfigError, match="unknown attention=dense: choose one of auto, fused, sparse"):
+        RayTracer("dense")
 
 
 def test_tracer_without_kernels_lists_the_pairs(random_cameras):

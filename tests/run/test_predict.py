@@ -89,7 +89,7 @@ def oracle(monkeypatch) -> Oracle:
     model = Oracle()
     settings = PredictionSettings(preset="tiny", stage="shape", image_size=IMAGE_SIZE, num_views=96)
     monkeypatch.setattr(module, "prediction_settings", lambda path: settings)
-    monkeypatch.setattr(module, "load_model", lambda path: model)
+    monkeypatch.setattr(module, "load_model", lambda path, attention: model)
     return model
 
 
@@ -115,6 +115,7 @@ def config(folder, output, **changes) -> DictConfig:
         "truth": None,
         "views_at_once": 4,
         "device": "cpu",
+        "attention": "auto",
     }
     return OmegaConf.create(values | changes)
 

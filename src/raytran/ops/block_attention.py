@@ -35,17 +35,20 @@ INTERPRETED = not isinstance(attend_forward, triton.JITFunction)
 _OPERANDS = {torch.float16: tl.float16, torch.bfloat16: tl.bfloat16, torch.float32: tl.float32}
 
 
-def _tuned(kernel: Any) -> Any:
-    """Let Triton choose, once per dtype, head size and direction, how many warps share a program."""
-    if INTERPRETED:
-        return kernel
-    configs = [triton.Config({}, num_warps=w, num_stages=s) for w in (2, 4) for s in (2, 3)]
-    return triton.autotune(configs, key=["TILES", "DIM", "OPERAND"])(kernel)
+_LONGEST_RUN = 1 << 30
+"""In place of the length of a run, so that runs of all lengths are one kernel."""
 
 
-_forward, _backward_targets, _backward_sources = map(
-    _tuned, (attend_forward, attend_backward_targets, attend_backward_sources)
-)
+def warps_of(dtype: torch.dtype, width: int) -> int:
+    """Return how many warps share a program that goes along a row of 32, for inputs of ``width`` channels.
+
+    Tensor cores take 16 rows a warp, so that more than two warps would do everything twice; there are more
+    where two had not enough registers. One choice for all GPUs, not one by measured time, which could differ
+    between the ranks of a run. A test asks the compiler whether anything spills.
+    """
+    if dtype == torch.float32:
+        return 4 if width <= 32 else 8
+    return 2 if width <= 32 else 4
 
 
 def block_attention(
@@ -77,8 +80,14 @@ def tensors_of(order: BlockOrder) -> list[Tensor]:
 
 
 def layout_of(tiling: Tiling) -> list[int]:
-    """Return the sizes of a grid, its boxes and their parts as an operator takes them."""
-    return [*tiling.shape[1:], *tiling.tile, *tiling.part]
+    """Return the sizes of a tiling's boxes, of their parts and of a grid as an operator takes them."""
+    grid = (1, 1, _LONGEST_RUN) if tiling.is_run else tiling.shape[1:]
+    return [*tiling.tile, *tiling.part, *grid]
+
+
+def constants_of(layout: Sequence[int]) -> tuple[tuple[int, ...], ...]:
+    """Return ``layout_of`` as the kernels take it: box, part, grid."""
+    return tuple(layout[:3]), tuple(layout[3:6]), tuple(layout[6:])
 
 
 @torch.library.custom_op("raytran::block_attention", mutates_args=())
@@ -98,7 +107,9 @@ def _attend(
     outputs = torch.empty_like(query), query.new_empty(query.shape[:2], dtype=torch.float32)
     parts = launch.scratch(query.shape[2]), launch.scratch(1)
     with torch.cuda.device_of(query):
-        _forward[launch.grid]((query, key, value), outputs, parts, *launch.arguments(masks, query.dtype))
+        attend_forward[launch.grid](
+            (query, key, value), outputs, parts, *launch.arguments(masks), num_warps=launch.num_warps
+        )
         launch.merge(merge_forward, outputs, parts)
     return outputs
 
@@ -121,15 +132,17 @@ def _attend_backward(
     with torch.cuda.device_of(query):
         launch = Launch(query, key, by_target, targets, sources)
         part = launch.scratch(query.shape[2])
-        _backward_targets[launch.grid](
-            inputs, logsumexp, (d_query, delta), part, *launch.arguments(masks, query.dtype)
+        arguments = launch.arguments(masks)
+        attend_backward_targets[launch.grid](
+            inputs, logsumexp, (d_query, delta), part, *arguments, num_warps=launch.num_warps
         )
         launch.merge(merge_sums, d_query, part)
         del part
         launch = Launch(key, query, by_source, sources, targets)
         parts = launch.scratch(query.shape[2]), launch.scratch(query.shape[2])
-        _backward_sources[launch.grid](
-            inputs, (logsumexp, delta), (d_key, d_value), parts, *launch.arguments(masks, query.dtype)
+        arguments = launch.arguments(masks)
+        attend_backward_sources[launch.grid](
+            inputs, (logsumexp, delta), (d_key, d_value), parts, *arguments, num_warps=launch.num_warps
         )
         launch.merge(merge_sums, d_key, parts[0])
         launch.merge(merge_sums, d_value, parts[1])
@@ -141,7 +154,7 @@ class Launch:
 
     Args:
         row: ``(R, H, D)`` a tensor of the rows' side, targets or sources.
-        other: ``(J, H, D)`` one of the other side.
+        other: ``(J, H, D)`` one of the other side, of the dtype that is multiplied in.
         order: tensors of the ``BlockOrder`` of the rows.
         rows: layout of the rows' grid.
         others: layout of the other grid.
@@ -156,13 +169,12 @@ class Launch:
         others: Sequence[int],
     ) -> None:
         self._row, self._order = row, order
-        _, self._heads, self._dim = row.shape
-        self._shape = tuple(rows[:3])
-        self._tile, other_tile = ((tuple(side[3:6]), tuple(side[6:])) for side in (rows, others))
+        self._num_rows, self._heads, self._dim = row.shape
+        self._num_others, self._dtype = other.shape[0], other.dtype
+        self._rows, self._others = constants_of(rows), constants_of(others)
         self._width = max(16, triton.next_power_of_2(self._dim))
-        self._sizes = self._shape, tuple(others[:3]), row.shape[0], other.shape[0], self._heads
-        self._constants = (self._tile, other_tile), self._dim, self._width
         self.grid = (order[2].shape[0] * self._heads,)
+        self.num_warps = warps_of(self._dtype, self._width)
 
     def scratch(self, width: int) -> Tensor:
         """Return memory for the pieces of long rows."""
@@ -170,18 +182,20 @@ class Launch:
             2 * self._order[3].shape[0] * ROW * self._heads * width, dtype=torch.float32
         )
 
-    def arguments(self, masks: Tensor, dtype: torch.dtype) -> tuple[Any, ...]:
-        """Return the kernels' arguments from ``order`` on, for inputs of a dtype."""
+    def arguments(self, masks: Tensor) -> tuple[Any, ...]:
+        """Return the kernels' arguments from ``order`` on."""
         # The interpreter multiplies float32 alone rightly; elsewhere operands stay what they are.
-        operand = tl.float32 if INTERPRETED else _OPERANDS[dtype]
-        return (*self._order[:3], masks), self._sizes, *self._constants, operand
+        operand = tl.float32 if INTERPRETED else _OPERANDS[self._dtype]
+        sizes = self._num_rows, self._num_others, self._heads
+        return (*self._order[:3], masks), *sizes, self._rows, self._others, self._dim, self._width, operand
 
     def merge(self, kernel: Any, result: Any, parts: Any) -> None:
         """Put the pieces of long rows together."""
         merges = self._order[3]
         if merges.shape[0]:
+            sizes = self._num_rows, self._heads
             kernel[merges.shape[0] * self._heads,](
-                result, parts, merges, self._shape, self._heads, self._tile, self._dim, self._width
+                result, parts, merges, *sizes, self._rows, self._dim, self._width
             )
 
 

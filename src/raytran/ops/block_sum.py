@@ -15,8 +15,7 @@ from torch import Tensor
 from raytran.ops.block_attention import Launch, layout_of, tensors_of
 from raytran.ops.block_pairs import BlockPairs
 from raytran.ops.triton_attention import (
-    box_inside,
-    box_offsets,
+    box_elements,
     load_elements,
     load_parts,
     part_offsets,
@@ -61,36 +60,38 @@ def _sum(
     launch = Launch(out, grouped, by_target, targets, sources)
     part = launch.scratch(width)
     with torch.cuda.device_of(source):
-        sum_boxes[launch.grid](grouped, out, part, *launch.arguments(masks, grouped.dtype))
+        sum_boxes[launch.grid](grouped, out, part, *launch.arguments(masks), num_warps=launch.num_warps)
         launch.merge(merge_sums, out, part)
     return out.view(num_targets, channels)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["num_rows", "num_others"])
 def sum_boxes(
     source_ptr: tl.tensor,
     out_ptr: tl.tensor,
     part_ptr: tl.tensor,
     order: tl.tuple,
-    sizes: tl.tuple,
-    TILES: tl.constexpr,
+    num_rows: tl.tensor,
+    num_others: tl.tensor,
+    heads: tl.tensor,
+    ROWS: tl.constexpr,
+    OTHERS: tl.constexpr,
     DIM: tl.constexpr,
     WIDTH: tl.constexpr,
     OPERAND: tl.constexpr,
 ) -> None:
     """Sum over each target of a row the sources it is joined with, for one group of channels."""
-    heads = sizes[4]
     item_ptr, head = order[2] + tl.program_id(0) // heads * 4, tl.program_id(0) % heads
     start, last, slot = tl.load(item_ptr), tl.load(item_ptr + 2), tl.load(item_ptr + 3)
     if start < 0:
         return
-    offsets = part_offsets(sizes[1], TILES[1])
+    offsets = part_offsets(OTHERS)
     summed = tl.zeros((32, WIDTH), tl.float32)
     for first in range(tl.load(item_ptr + 1), last, 8):
-        source, exists, joined = load_parts(order, first, last, offsets, sizes[3])
+        source, exists, joined = load_parts(order, first, last, offsets, num_others)
         feature = load_elements(source_ptr, source, exists, head, heads, DIM, WIDTH, OPERAND)
         summed = tl.dot(joined.to(OPERAND), feature, summed, input_precision="ieee")
-    target, inside = start + box_offsets(sizes[0], TILES[0]), box_inside(start, sizes[0], TILES[0])
+    target, inside = box_elements(start, num_rows, ROWS)
     store_sum(out_ptr, part_ptr, summed, target, inside, slot, head, heads, DIM)
 
 

@@ -7,34 +7,51 @@ import logging
 import os
 from functools import cache
 from importlib.util import find_spec
+from typing import Literal
 
 import torch
 
 from raytran.ops.block_pairs import BlockPairs, kept
 from raytran.ops.pairs import PairList
 
-_DTYPES = (torch.float16, torch.bfloat16, torch.float32)
+Attention = Literal["auto", "fused", "sparse"]
+"""By what ray-traced attention is computed: fused kernels where they run, fused kernels, or torch.sparse."""
 
-_INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
-"""Triton's kernels run on any device, slowly, to be tested; only ``BlockPairs`` ask for that."""
+MOST_CHANNELS = {torch.float16: 128, torch.bfloat16: 128, torch.float32: 64}
+"""Channels of a head up to which the fused kernels fit into a GPU's registers, by the dtype of the inputs."""
 
 _log = logging.getLogger(__name__)
 
 
-def has_kernels(device: torch.device) -> bool:
-    """Return whether the fused kernels run on a device."""
-    return device.type == "cuda" and _has_triton()
+def interpreted() -> bool:
+    """Return whether Triton's kernels run in its interpreter: on any device, slowly, to be tested."""
+    return os.environ.get("TRITON_INTERPRET") == "1"
 
 
-def fused_blocks(pairs: PairList | BlockPairs, device: torch.device, dtype: torch.dtype) -> BlockPairs | None:
-    """Return the block pairs for the fused kernels; None, and say once why, where they do not run."""
-    if device.type != "cuda" and not (_INTERPRETED and isinstance(pairs, BlockPairs)):
-        reason = f"tensors are on the {device.type.upper()}"
-    elif not _has_triton():
-        reason = "Triton is not installed"
-    elif dtype not in _DTYPES:
-        reason = f"tensors are {dtype}"
-    else:
+def why_no_kernels(device: torch.device) -> str | None:
+    """Say why the fused kernels do not run on a device, None where they do."""
+    if device.type != "cuda":
+        return f"tensors are on the {device.type.upper()}"
+    return None if find_spec("triton") is not None else "Triton is not installed"
+
+
+def fused_blocks(
+    pairs: PairList | BlockPairs, device: torch.device, dtype: torch.dtype, channels: int
+) -> BlockPairs | None:
+    """Return the block pairs for the fused kernels; None, and say once why, where they do not run.
+
+    Args:
+        pairs: the pairs; block pairs on a CPU ask for Triton's interpreter, if that is switched on.
+        device: of the features.
+        dtype: of the features.
+        channels: of each head.
+    """
+    reason = None if interpreted() and isinstance(pairs, BlockPairs) else why_no_kernels(device)
+    if isinstance(pairs, PairList) and not pairs.fused:
+        reason = "the pairs ask for it"
+    elif reason is None and channels > MOST_CHANNELS.get(dtype, 0):
+        reason = f"heads have {channels} channels in {dtype}"
+    if reason is None:
         return pairs.blocks() if isinstance(pairs, PairList) else pairs
     if not torch.compiler.is_compiling():
         _log_once(logging.WARNING if device.type == "cuda" else logging.DEBUG, reason)
@@ -46,10 +63,6 @@ def listed(pairs: PairList | BlockPairs) -> PairList:
     if isinstance(pairs, PairList):
         return pairs
     return kept(pairs, "_listed", lambda: PairList.from_blocks(pairs))
-
-
-def _has_triton() -> bool:
-    return find_spec("triton") is not None
 
 
 @cache

@@ -47,6 +47,7 @@ class PairList(Parcel):
         num_voxels: voxels in all, with or without a pair.
         pixel_shape: ``(views, h, w)`` if known; makes square tiles of ``blocks()``.
         voxel_shape: ``(B, X, Y, Z)`` if known; makes cubic blocks.
+        fused: whether the fused kernels may take the pairs; False leaves them to ``torch.sparse`` everywhere.
 
     Raises:
         ShapeError: the indices are not two vectors of one length, or a shape is not of so many elements.
@@ -58,6 +59,7 @@ class PairList(Parcel):
     num_voxels: int
     pixel_shape: tuple[int, int, int] | None = None
     voxel_shape: tuple[int, int, int, int] | None = None
+    fused: bool = True
 
     def __post_init__(self) -> None:
         check_shape(self.pixel_index, "P", "pixel_index")

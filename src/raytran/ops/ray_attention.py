@@ -88,7 +88,7 @@ def _attend(
         if tensor.shape != (sources, *query.shape[1:]):
             check_shape(tensor, f"{sources} {query.shape[1]} {query.shape[2]}", name)
     dtype = torch.promote_types(torch.promote_types(query.dtype, key.dtype), value.dtype)
-    blocks = fused_blocks(pairs, query.device, dtype)
+    blocks = fused_blocks(pairs, query.device, dtype, query.shape[2])
     if blocks is not None:
         # CPU installations of torch lack Triton: its module is imported only where it runs.
         from raytran.ops.block_attention import block_attention

@@ -34,7 +34,8 @@ def splat_features(features: Tensor, pairs: PairList | BlockPairs) -> tuple[Tens
     """
     if features.ndim != 2 or features.shape[0] != pairs.num_pixels:
         check_shape(features, f"{pairs.num_pixels} C", "features")
-    blocks = fused_blocks(pairs, features.device, features.dtype)
+    # The kernel takes as many channels together as it can: any number fits.
+    blocks = fused_blocks(pairs, features.device, features.dtype, channels=1)
     if blocks is not None:
         # CPU installations of torch lack Triton: its module is imported only where it runs.
         from raytran.ops.block_sum import block_sum

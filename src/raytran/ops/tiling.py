@@ -50,6 +50,11 @@ class Tiling:
         return cls((1, 1, 1, count), (1, 1, ROW), (1, 1, PART))
 
     @property
+    def is_run(self) -> bool:
+        """Whether boxes are runs of elements of unknown layout."""
+        return self.tile == (1, 1, ROW)
+
+    @property
     def num_elements(self) -> int:
         """Elements of all grids."""
         return prod(self.shape)

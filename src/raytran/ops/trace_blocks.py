@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Traversal on a GPU: from the cameras straight to block pairs, and without waiting for the GPU.
+"""Traversal on a GPU: from the cameras straight to block pairs.
 
 It finds the same pairs as ``trace_pairs`` but never lists them. First every ray is tested against every
 block of voxels, then the rays of each tile that touches a block against its voxels. At the paper's size that
@@ -9,7 +9,7 @@ its schedulers are busy; the bytes (3 MB of rays, 5 MB of masks, 1 MB of marks) 
 hundred small launches for the rays and the orders 0.5 ms. Reckoned, not measured. Work grows linearly with
 views.
 
-How many block pairs there are only the GPU knows; ``ray_tracer`` says how the host need not wait to hear it.
+How many block pairs there are only the GPU knows: the host waits for their number, or gives a capacity.
 """
 
 from __future__ import annotations
@@ -74,12 +74,11 @@ def _trace(
 ) -> tuple[BlockPairs, Tensor]:
     """Return the block pairs and their number; ``rays`` as the kernels take them and the tiles' pixels."""
     tiles, blocks, scenes = pixels.num_tiles, voxels.num_tiles, voxels.shape[0]
-    sizes = pixels.shape[1:], voxels.shape[1:], voxels.tiles[1:]
     blocks_of_scene, device = blocks // scenes, rays[1].device
     touched = torch.empty(tiles, blocks_of_scene, dtype=torch.int8, device=device)
     grid = tiles, triton.cdiv(blocks_of_scene, _BLOCKS_AT_ONCE)
-    boxes = (pixels.tile, pixels.part), (voxels.tile, voxels.part)
-    touch_blocks[grid](*rays, touched, sizes, *boxes, rays_per_pixel, _BLOCKS_AT_ONCE, NUDGE)
+    boxes = [(tiling.tile, tiling.part, tiling.shape[1:]) for tiling in (pixels, voxels)]
+    touch_blocks[grid](*rays, touched, blocks_of_scene, *boxes, rays_per_pixel, _BLOCKS_AT_ONCE, NUDGE)
     last = touched.sum(dim=1, dtype=torch.int64).cumsum(0)
     first = torch.nn.functional.pad(last[:-1], (1, 0))
     capacity = int(last[-1]) if capacity is None else capacity
@@ -89,5 +88,6 @@ def _trace(
         list_blocks[tiles,](
             touched, first, keys, capacity, blocks_of_scene, tiles // scenes, blocks, _BLOCKS_AT_ONCE
         )
-        mask_blocks[capacity,](*rays, keys, masks, sizes, tiles, blocks, *boxes, rays_per_pixel, NUDGE)
+        sizes = tiles, blocks_of_scene, blocks
+        mask_blocks[capacity,](*rays, keys, masks, *sizes, *boxes, rays_per_pixel, NUDGE)
     return BlockPairs(keys, masks, pixels, voxels), last[-1]

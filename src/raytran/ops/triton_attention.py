@@ -17,9 +17,10 @@ read the inputs and write the outputs takes 0.045 ms. Reckoned from the compiled
 
 "Source" and "target" are those of the attention; in ``attend_backward_sources`` the rows are sources. ``DIM``
 channels of a head are padded to a power of two, ``WIDTH``. Logarithms are to base 2. Arguments that belong
-together are tuples: ``order`` is (part_start, place, items) of a ``BlockOrder`` and the masks; ``sizes`` is
-(shape of the rows' grid, shape of the other grid, elements of either, heads); a tile is (box, part) of a
-``Tiling``.
+together are tuples: ``order`` is (part_start, place, items) of a ``BlockOrder`` and the masks. ``ROWS`` and
+``OTHERS`` are constants, the (box, part, grid) of a ``Tiling`` along its three axes, the number of grids left
+out: a new number of views compiles nothing. Each is an argument of its own, and numbers that may be 1 are in
+no tuple, because Triton before 3.8 loses constants that it passes on out of a tuple.
 """
 
 from __future__ import annotations
@@ -41,27 +42,34 @@ def box_cells(slot: tl.tensor, TILE: tl.constexpr) -> tl.tuple:
 
 
 @triton.jit
-def box_offsets(shape: tl.tuple, TILE: tl.constexpr) -> tl.tensor:
+def box_offsets(TILE: tl.constexpr) -> tl.tensor:
     """Return how many elements each slot of a box lies behind its first, ``(32,)``: ``Tiling.offset``."""
     a, b, c = box_cells(tl.arange(0, 32), TILE)
-    return (a * shape[1] + b) * shape[2] + c
+    return (a * TILE[2][1] + b) * TILE[2][2] + c
 
 
 @triton.jit
-def box_inside(start: tl.tensor, shape: tl.tuple, TILE: tl.constexpr) -> tl.tensor:
+def box_inside(start: tl.tensor, TILE: tl.constexpr) -> tl.tensor:
     """Return which slots of the box that begins at ``start`` are inside its grid, ``(32,)``."""
     a, b, c = box_cells(tl.arange(0, 32), TILE)
-    a += start // (shape[1] * shape[2]) % shape[0]
-    b += start // shape[2] % shape[1]
-    c += start % shape[2]
-    return (a < shape[0]) & (b < shape[1]) & (c < shape[2])
+    a += start // (TILE[2][1] * TILE[2][2]) % TILE[2][0]
+    b += start // TILE[2][2] % TILE[2][1]
+    c += start % TILE[2][2]
+    return (a < TILE[2][0]) & (b < TILE[2][1]) & (c < TILE[2][2])
 
 
 @triton.jit
-def part_offsets(shape: tl.tuple, TILE: tl.constexpr) -> tl.tensor:
+def box_elements(start: tl.tensor, number: tl.tensor, TILE: tl.constexpr) -> tl.tuple:
+    """Return the elements of the box that begins at ``start``, ``(32,)``, and which of them exist."""
+    element = start + box_offsets(TILE)
+    return element, box_inside(start, TILE) & (element < number)
+
+
+@triton.jit
+def part_offsets(TILE: tl.constexpr) -> tl.tensor:
     """Return how many elements each slot of 8 parts lies behind its own part's first, ``(64,)``."""
     a, b, c = box_cells(tl.arange(0, 64) % 8, TILE)
-    return (a * shape[1] + b) * shape[2] + c
+    return (a * TILE[2][1] + b) * TILE[2][2] + c
 
 
 @triton.jit
@@ -117,33 +125,35 @@ def store_sum(
         tl.store(part_ptr + row * DIM + channel, summed, mask=(row >= 0) & (channel < DIM))
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["num_rows", "num_others"])
 def attend_forward(
     inputs: tl.tuple,
     outputs: tl.tuple,
     parts: tl.tuple,
     order: tl.tuple,
-    sizes: tl.tuple,
-    TILES: tl.constexpr,
+    num_rows: tl.tensor,
+    num_others: tl.tensor,
+    heads: tl.tensor,
+    ROWS: tl.constexpr,
+    OTHERS: tl.constexpr,
     DIM: tl.constexpr,
     WIDTH: tl.constexpr,
     OPERAND: tl.constexpr,
 ) -> None:
     """Give a row's targets the mean of the values they attend to, and the log-sum-exp of their scores."""
     scale: tl.constexpr = DIM**-0.5 * LOG2_E
-    heads = sizes[4]
     item_ptr, head = order[2] + tl.program_id(0) // heads * 4, tl.program_id(0) % heads
     start, last, slot = tl.load(item_ptr), tl.load(item_ptr + 2), tl.load(item_ptr + 3)
     if start < 0:
         return
-    target, inside = start + box_offsets(sizes[0], TILES[0]), box_inside(start, sizes[0], TILES[0])
+    target, inside = box_elements(start, num_rows, ROWS)
     query = load_elements(inputs[0], target, inside, head, heads, DIM, WIDTH, OPERAND)
-    offsets = part_offsets(sizes[1], TILES[1])
+    offsets = part_offsets(OTHERS)
     peak = tl.full((32,), -float("inf"), tl.float32)
     total = tl.zeros((32,), tl.float32)
     summed = tl.zeros((32, WIDTH), tl.float32)
     for first in range(tl.load(item_ptr + 1), last, 8):
-        source, exists, joined = load_parts(order, first, last, offsets, sizes[3])
+        source, exists, joined = load_parts(order, first, last, offsets, num_others)
         key = load_elements(inputs[1], source, exists, head, heads, DIM, WIDTH, OPERAND)
         value = load_elements(inputs[2], source, exists, head, heads, DIM, WIDTH, OPERAND)
         score = tl.dot(query, tl.trans(key), input_precision="ieee")
@@ -188,14 +198,14 @@ def _finish(
         tl.store(parts[1] + (slot * heads + head) * 32 + tl.arange(0, 32), logsumexp)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["num_rows"])
 def merge_forward(
     outputs: tl.tuple,
     parts: tl.tuple,
     merges_ptr: tl.tensor,
-    shape: tl.tuple,
+    num_rows: tl.tensor,
     heads: tl.tensor,
-    TILE: tl.constexpr,
+    ROWS: tl.constexpr,
     DIM: tl.constexpr,
     WIDTH: tl.constexpr,
 ) -> None:
@@ -217,5 +227,5 @@ def merge_forward(
         weight, fade = tl.exp2(logsumexp - shift), tl.exp2(peak - shift)
         total, peak = total * fade + weight, higher
         summed = summed * fade[:, None] + mean * weight[:, None]
-    target, inside = start + box_offsets(shape, TILE), box_inside(start, shape, TILE)
+    target, inside = box_elements(start, num_rows, ROWS)
     _finish(outputs, parts, peak, total, summed, target, inside, start * 0 - 1, head, heads, DIM)

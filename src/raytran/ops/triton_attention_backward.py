@@ -8,8 +8,7 @@ import triton.language as tl
 
 from raytran.ops.triton_attention import (
     LOG2_E,
-    box_inside,
-    box_offsets,
+    box_elements,
     load_elements,
     load_parts,
     part_offsets,
@@ -17,15 +16,18 @@ from raytran.ops.triton_attention import (
 )
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["num_rows", "num_others"])
 def attend_backward_targets(
     inputs: tl.tuple,
     saved: tl.tuple,
     outputs: tl.tuple,
     part_ptr: tl.tensor,
     order: tl.tuple,
-    sizes: tl.tuple,
-    TILES: tl.constexpr,
+    num_rows: tl.tensor,
+    num_others: tl.tensor,
+    heads: tl.tensor,
+    ROWS: tl.constexpr,
+    OTHERS: tl.constexpr,
     DIM: tl.constexpr,
     WIDTH: tl.constexpr,
     OPERAND: tl.constexpr,
@@ -36,12 +38,11 @@ def attend_backward_targets(
     ``outputs`` are the gradient of the queries and that sum.
     """
     scale: tl.constexpr = DIM**-0.5
-    heads = sizes[4]
     item_ptr, head = order[2] + tl.program_id(0) // heads * 4, tl.program_id(0) % heads
     start, last, slot = tl.load(item_ptr), tl.load(item_ptr + 2), tl.load(item_ptr + 3)
     if start < 0:
         return
-    target, inside = start + box_offsets(sizes[0], TILES[0]), box_inside(start, sizes[0], TILES[0])
+    target, inside = box_elements(start, num_rows, ROWS)
     query = load_elements(inputs[0], target, inside, head, heads, DIM, WIDTH, OPERAND)
     grad = load_elements(inputs[4], target, inside, head, heads, DIM, WIDTH, OPERAND)
     out = load_elements(inputs[3], target, inside, head, heads, DIM, WIDTH, tl.float32)
@@ -50,10 +51,10 @@ def attend_backward_targets(
     # Every piece of a row writes the same.
     tl.store(outputs[1] + at, delta, mask=inside)
     logsumexp = tl.load(saved + at, mask=inside, other=float("inf"))
-    offsets = part_offsets(sizes[1], TILES[1])
+    offsets = part_offsets(OTHERS)
     summed = tl.zeros((32, WIDTH), tl.float32)
     for first in range(tl.load(item_ptr + 1), last, 8):
-        source, exists, joined = load_parts(order, first, last, offsets, sizes[3])
+        source, exists, joined = load_parts(order, first, last, offsets, num_others)
         key = load_elements(inputs[1], source, exists, head, heads, DIM, WIDTH, OPERAND)
         value = load_elements(inputs[2], source, exists, head, heads, DIM, WIDTH, OPERAND)
         score = tl.dot(query, tl.trans(key), input_precision="ieee")
@@ -65,15 +66,18 @@ def attend_backward_targets(
     store_sum(outputs[0], part_ptr, summed * scale, target, inside, slot, head, heads, DIM)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["num_rows", "num_others"])
 def attend_backward_sources(
     inputs: tl.tuple,
     saved: tl.tuple,
     outputs: tl.tuple,
     parts: tl.tuple,
     order: tl.tuple,
-    sizes: tl.tuple,
-    TILES: tl.constexpr,
+    num_rows: tl.tensor,
+    num_others: tl.tensor,
+    heads: tl.tensor,
+    ROWS: tl.constexpr,
+    OTHERS: tl.constexpr,
     DIM: tl.constexpr,
     WIDTH: tl.constexpr,
     OPERAND: tl.constexpr,
@@ -81,21 +85,20 @@ def attend_backward_sources(
     """Make the gradients of a row's keys and values; here the rows are sources.
 
     ``inputs`` are query, key, value, out and the gradient of out; ``saved`` are the log-sum-exp and the sum
-    of ``attend_backward_targets``; ``sizes`` and ``TILES`` name the rows' grid, the sources', first.
+    of ``attend_backward_targets``.
     """
     scale: tl.constexpr = DIM**-0.5
-    heads = sizes[4]
     item_ptr, head = order[2] + tl.program_id(0) // heads * 4, tl.program_id(0) % heads
     start, last, slot = tl.load(item_ptr), tl.load(item_ptr + 2), tl.load(item_ptr + 3)
     if start < 0:
         return
-    source, inside = start + box_offsets(sizes[0], TILES[0]), box_inside(start, sizes[0], TILES[0])
+    source, inside = box_elements(start, num_rows, ROWS)
     key = load_elements(inputs[1], source, inside, head, heads, DIM, WIDTH, OPERAND)
     value = load_elements(inputs[2], source, inside, head, heads, DIM, WIDTH, OPERAND)
-    offsets = part_offsets(sizes[1], TILES[1])
+    offsets = part_offsets(OTHERS)
     d_key, d_value = tl.zeros((32, WIDTH), tl.float32), tl.zeros((32, WIDTH), tl.float32)
     for first in range(tl.load(item_ptr + 1), last, 8):
-        target, exists, joined = load_parts(order, first, last, offsets, sizes[3])
+        target, exists, joined = load_parts(order, first, last, offsets, num_others)
         query = load_elements(inputs[0], target, exists, head, heads, DIM, WIDTH, OPERAND)
         grad = load_elements(inputs[4], target, exists, head, heads, DIM, WIDTH, OPERAND)
         at = target.to(tl.int64) * heads + head
@@ -113,14 +116,14 @@ def attend_backward_sources(
     store_sum(outputs[1], parts[1], d_value, source, inside, slot, head, heads, DIM)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["num_rows"])
 def merge_sums(
     out_ptr: tl.tensor,
     part_ptr: tl.tensor,
     merges_ptr: tl.tensor,
-    shape: tl.tuple,
+    num_rows: tl.tensor,
     heads: tl.tensor,
-    TILE: tl.constexpr,
+    ROWS: tl.constexpr,
     DIM: tl.constexpr,
     WIDTH: tl.constexpr,
 ) -> None:
@@ -134,5 +137,5 @@ def merge_sums(
     for slot in range(tl.load(merge_ptr + 1), tl.load(merge_ptr + 2)):
         row = (slot * heads + head) * 32 + tl.arange(0, 32)
         summed += tl.load(part_ptr + row[:, None] * DIM + channel, mask=channel < DIM, other=0.0)
-    element, inside = start + box_offsets(shape, TILE), box_inside(start, shape, TILE)
+    element, inside = box_elements(start, num_rows, ROWS)
     store_sum(out_ptr, part_ptr, summed, element, inside, start * 0 - 1, head, heads, DIM)

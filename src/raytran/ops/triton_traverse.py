@@ -7,8 +7,8 @@ the intersection of three of them, and the box counts if that is longer than ``N
 the same: no pair is lost by testing blocks first.
 
 ``rays`` are origins ``(views, 3)`` in voxels and depths per voxel along the axes ``(pixels · r, 3)``, 0 for a
-ray parallel to the axis' planes, r rays a pixel one after another; ``sizes`` is (shape of a view's map
-(1, h, w), resolution, blocks along the axes).
+ray parallel to the axis' planes, r rays a pixel one after another. ``TILE`` and ``BLOCK`` are the (box, part,
+grid) of the tilings of pixels and voxels, see ``triton_attention``.
 """
 
 from __future__ import annotations
@@ -26,15 +26,14 @@ def _crossed(
     number: tl.tensor,
     low: tl.tuple,
     high: tl.tuple,
-    sizes: tl.tuple,
     TILE: tl.constexpr,
     RAYS: tl.constexpr,
     NUDGE: tl.constexpr,
 ) -> tl.tensor:
     """Return which boxes, ``low`` to ``high``, the rays of that number of a tile's pixels run through."""
-    ray = (start + box_offsets(sizes[0], TILE)).to(tl.int64) * RAYS + number
-    there = box_inside(start, sizes[0], TILE)
-    origin_ptr = rays[0] + start // (sizes[0][1] * sizes[0][2]) * 3
+    ray = (start + box_offsets(TILE)).to(tl.int64) * RAYS + number
+    there = box_inside(start, TILE)
+    origin_ptr = rays[0] + start // (TILE[2][1] * TILE[2][2]) * 3
     near = tl.zeros((ray.shape[0], low[0].shape[0]), tl.float64)
     far = near + float("inf")
     for axis in tl.static_range(3):
@@ -54,10 +53,11 @@ def _crossed(
 
 
 @triton.jit
-def _block_cell(block: tl.tensor, counts: tl.tuple, BLOCK: tl.constexpr) -> tl.tuple:
+def _block_cell(block: tl.tensor, BLOCK: tl.constexpr) -> tl.tuple:
     """Return the first voxel of blocks of a scene, along the three axes."""
-    a, b = block // (counts[1] * counts[2]), block // counts[2] % counts[1]
-    return a * BLOCK[0][0], b * BLOCK[0][1], block % counts[2] * BLOCK[0][2]
+    b_blocks, c_blocks = tl.cdiv(BLOCK[2][1], BLOCK[0][1]), tl.cdiv(BLOCK[2][2], BLOCK[0][2])
+    a, b = block // (b_blocks * c_blocks), block // c_blocks % b_blocks
+    return a * BLOCK[0][0], b * BLOCK[0][1], block % c_blocks * BLOCK[0][2]
 
 
 @triton.jit
@@ -65,7 +65,7 @@ def touch_blocks(
     rays: tl.tuple,
     starts_ptr: tl.tensor,
     touched_ptr: tl.tensor,
-    sizes: tl.tuple,
+    num_blocks: tl.tensor,
     TILE: tl.constexpr,
     BLOCK: tl.constexpr,
     RAYS: tl.constexpr,
@@ -75,23 +75,21 @@ def touch_blocks(
     """Write for a pixel tile which of some voxel blocks of its scene its rays run through."""
     tile, block = tl.program_id(0), tl.program_id(1) * BLOCKS + tl.arange(0, BLOCKS)
     start = tl.load(starts_ptr + tile)
-    resolution, counts = sizes[1], sizes[2]
-    a, b, c = _block_cell(block, counts, BLOCK)
+    a, b, c = _block_cell(block, BLOCK)
     high = (
-        tl.minimum(a + BLOCK[0][0], resolution[0]),
-        tl.minimum(b + BLOCK[0][1], resolution[1]),
-        tl.minimum(c + BLOCK[0][2], resolution[2]),
+        tl.minimum(a + BLOCK[0][0], BLOCK[2][0]),
+        tl.minimum(b + BLOCK[0][1], BLOCK[2][1]),
+        tl.minimum(c + BLOCK[0][2], BLOCK[2][2]),
     )
     touched = tl.zeros((BLOCKS,), tl.int32)
     for number in range(RAYS):
-        crossed = _crossed(rays, start, number, (a, b, c), high, sizes, TILE, RAYS, NUDGE)
+        crossed = _crossed(rays, start, number, (a, b, c), high, TILE, RAYS, NUDGE)
         touched = tl.maximum(touched, tl.max(crossed.to(tl.int32), axis=0))
-    num_blocks = counts[0] * counts[1] * counts[2]
     at = tile.to(tl.int64) * num_blocks + block
     tl.store(touched_ptr + at, touched.to(tl.int8), mask=block < num_blocks)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["capacity", "tiles_of_scene"])
 def list_blocks(
     touched_ptr: tl.tensor,
     first_ptr: tl.tensor,
@@ -115,14 +113,14 @@ def list_blocks(
         place += tl.sum(touched, axis=0)
 
 
-@triton.jit
+@triton.jit(do_not_specialize=["num_tiles"])
 def mask_blocks(
     rays: tl.tuple,
     starts_ptr: tl.tensor,
     keys_ptr: tl.tensor,
     masks_ptr: tl.tensor,
-    sizes: tl.tuple,
     num_tiles: tl.tensor,
+    num_blocks: tl.tensor,
     all_blocks: tl.tensor,
     TILE: tl.constexpr,
     BLOCK: tl.constexpr,
@@ -136,15 +134,14 @@ def mask_blocks(
     crossed = tl.zeros((32, 32), tl.int32)
     if tile < num_tiles:
         start = tl.load(starts_ptr + tile)
-        resolution, counts = sizes[1], sizes[2]
-        block = (key % all_blocks % (counts[0] * counts[1] * counts[2])).to(tl.int32)
-        first, cell = _block_cell(block, counts, BLOCK), box_cells(slot, BLOCK)
+        block = (key % all_blocks % num_blocks).to(tl.int32)
+        first, cell = _block_cell(block, BLOCK), box_cells(slot, BLOCK)
         low = (first[0] + cell[0], first[1] + cell[1], first[2] + cell[2])
         high = (low[0] + 1, low[1] + 1, low[2] + 1)
         for number in range(RAYS):
-            found = _crossed(rays, start, number, low, high, sizes, TILE, RAYS, NUDGE)
+            found = _crossed(rays, start, number, low, high, TILE, RAYS, NUDGE)
             crossed = crossed | found.to(tl.int32)
-        inside = (low[0] < resolution[0]) & (low[1] < resolution[1]) & (low[2] < resolution[2])
+        inside = (low[0] < BLOCK[2][0]) & (low[1] < BLOCK[2][1]) & (low[2] < BLOCK[2][2])
         crossed = tl.where(inside[None, :], crossed, 0)
     mask_ptr = masks_ptr + pair.to(tl.int64) * 64 + slot
     tl.store(mask_ptr, tl.sum(crossed << slot[:, None], axis=0))

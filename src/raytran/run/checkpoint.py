@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, cast
 import torch
 
 from raytran.errors import CheckpointError
+from raytran.ops.fused import Attention
+from raytran.ops.ray_tracer import RayTracer
 from raytran.run.weights import checkpoint_path
 from raytran.training.checkpoint_content import FORMAT
 from raytran.training.checkpoint_file import read_checkpoint
@@ -48,17 +50,21 @@ def checkpoint_card(
     }
 
 
-def load_model(checkpoint: str | Path) -> RayTran:
+def load_model(checkpoint: str | Path, *, attention: Attention = "auto") -> RayTran:
     """Return the model of a checkpoint, in evaluation mode, on the CPU.
 
     Args:
         checkpoint: path of the file, or ``default`` for the weights that the package carries.
+        attention: as in ``RayTran``; what the network was trained with does not matter.
 
     Raises:
         CheckpointError: the file is missing, damaged, or its weights do not fit the model described in it.
+        ConfigError: there is no such attention.
     """
     path = checkpoint_path(checkpoint)
-    return model_from(read_checkpoint(path), path)
+    model = model_from(read_checkpoint(path), path)
+    model.ray_tracer = RayTracer(attention)
+    return model
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,7 @@ def _build(node: Any, source: object) -> Any:
             return values
         if "weights" in values:
             values["weights"] = None  # they are in the checkpoint: nothing is to be read or fetched
+        values.pop("attention", None)  # it says how the network was computed there, not what it is
         return _class(node["_target_"], source)(**values)
     if isinstance(node, list | tuple):
         return [_build(value, source) for value in node]

@@ -55,7 +55,7 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     output = Path(cfg.output)
     check_replaceable(output.resolve(), marker=MARKER)
     settings = prediction_settings(cfg.checkpoint)
-    model = load_model(cfg.checkpoint).to(choose_device(cfg.device))
+    model = load_model(cfg.checkpoint, attention=cfg.attention).to(choose_device(cfg.device))
     cfg = _in_its_preset(cfg, settings)
     # The stages before it leave the shape head untrained.
     tasks = TASKS_WITH_SHAPE if settings.stage == "shape" else TASKS

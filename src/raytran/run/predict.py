@@ -64,7 +64,7 @@ def predict(cfg: DictConfig) -> Path:
     settings = prediction_settings(cfg.checkpoint)
     if settings.stage in _UNTRAINED:
         _LOG.warning("%s is of stage %s: %s", cfg.checkpoint, settings.stage, _UNTRAINED[settings.stage])
-    model = load_model(cfg.checkpoint).to(choose_device(cfg.device))
+    model = load_model(cfg.checkpoint, attention=cfg.attention).to(choose_device(cfg.device))
     _check_channels(model, cfg.checkpoint)
     new_cameras = cameras_to_render(cfg.views, model, cfg.checkpoint)
     scene_id = scene.stem if scene.is_file() else scene.name
