@@ -131,6 +131,16 @@ def test_resume_continues_in_the_same_folder(settings, tmp_path):
     assert next(iter(content["optimizer_states"][0]["state"].values()))["step"] == 6
 
 
+def test_frozen_statistics_stay_in_a_run(settings, trained, tmp_path):
+    parent = trained[1][1].checkpoint
+    found = fit(settings, tmp_path / "run", "experiment=frozen_norms_stage2", f"init_from={parent}")
+    state = torch.load(found.checkpoint, weights_only=True)["state_dict"]
+    statistics = {name for name in state if "running_" in name or "num_batches" in name}
+    assert statistics
+    same = same_weights(parent, found.checkpoint)
+    assert statistics <= same < set(state)
+
+
 @pytest.mark.slow
 def test_attention_is_computed_as_the_run_says(settings, tmp_path, monkeypatch):
     """Fused in Triton's interpreter, which rounds otherwise, and by torch.sparse: nearly the same loss."""

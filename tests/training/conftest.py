@@ -62,7 +62,9 @@ def make_module():
 
     def make(experiment, *settings):
         torch.manual_seed(0)
-        cfg = compose("train", [*SMALL, f"experiment={experiment}", *settings])
+        presets = {item.partition("=")[0] for item in settings} & {"preset"}
+        small = [item for item in SMALL if item.partition("=")[0] not in presets]
+        cfg = compose("train", [*small, f"experiment={experiment}", *settings])
         return build_module(cfg, build_model(cfg))
 
     return make

@@ -7,6 +7,7 @@ from dataclasses import replace
 import lightning.pytorch as pl
 import pytest
 import torch
+from torch.nn.modules.batchnorm import _BatchNorm
 
 from raytran.errors import ConfigError
 from raytran.model import inputs_of
@@ -25,8 +26,8 @@ UNREACHED = dict.fromkeys(
 )
 
 
-def fit(module, batch, steps=2):
-    """Fit for a few steps; Lightning calls ``train()`` before and after the validation in between."""
+def fit(module, batch, steps=2, callbacks=()):
+    """Fit for a few steps, with a validation after each."""
     trainer = pl.Trainer(
         accelerator="cpu",
         max_steps=steps,
@@ -36,7 +37,7 @@ def fit(module, batch, steps=2):
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
-        callbacks=[StageSetup()],
+        callbacks=[StageSetup(), *callbacks],
     )
     loader = torch.utils.data.DataLoader([batch], batch_size=None)
     trainer.fit(module, loader, loader)
@@ -110,7 +111,7 @@ def test_frozen_parts_stay_in_evaluation_mode(batch, make_module):
     modes = []
 
     class Watch(pl.Callback):
-        def on_train_batch_start(self, trainer, pl_module, *_):
+        def on_before_zero_grad(self, trainer, pl_module, *_):
             modes.append({name: part.training for name, part in pl_module.model.named_modules()})
 
     trainer = pl.Trainer(
@@ -125,15 +126,45 @@ def test_frozen_parts_stay_in_evaluation_mode(batch, make_module):
     )
     loader = torch.utils.data.DataLoader([batch], batch_size=None)
     trainer.fit(module, loader, loader)
-    module.train()
-    modes.append({name: part.training for name, part in module.model.named_modules()})
-    assert len(modes) == 4
+    assert len(modes) == 3
     for mode in modes:
         assert mode["heads.shape"]
         assert mode["heads.shape.grow.0"]
         assert not any(
             training for name, training in mode.items() if name.startswith(("backbone", "heads.objects"))
         )
+
+
+@pytest.mark.parametrize("preset", ["tiny", "laptop"])
+def test_frozen_norms_learn_with_what_they_predict_with_and_keep_it(preset, batch, make_module):
+    module = make_module("frozen_norms_stage2", f"preset={preset}", "model.grid_resolution=[8,8,4]")
+    for name, buffer in module.model.named_buffers():
+        if name.endswith("running_var"):
+            buffer.fill_(0.7)
+    before = copy.deepcopy(module.model.state_dict())
+    fit(module, batch, steps=3)
+    after = module.model.state_dict()
+    norms = [name for name, part in module.model.named_modules() if isinstance(part, _BatchNorm)]
+    assert norms
+    for norm in norms:
+        for name in ("running_mean", "running_var", "num_batches_tracked"):
+            assert torch.equal(before[f"{norm}.{name}"], after[f"{norm}.{name}"]), norm
+    learning = {name for name, parameter in module.model.named_parameters() if parameter.requires_grad}
+    scales = {f"{norm}.weight" for norm in norms} & learning
+    assert scales
+    assert all(not torch.equal(before[name], after[name]) for name in scales), "scale and shift still learn"
+
+
+@pytest.mark.parametrize("experiment", ["stage2", "frozen_norms_stage2"])
+def test_statistics_move_or_stay_whatever_mode_somebody_sets(experiment, batch, make_module):
+    class Meddling(pl.Callback):
+        def on_train_batch_end(self, trainer, pl_module, *_):
+            pl_module.train(mode=experiment != "stage2")
+
+    module = make_module(experiment)
+    fit(module, batch, steps=3, callbacks=[Meddling()])
+    counts = {int(v) for name, v in module.model.named_buffers() if name.endswith("num_batches_tracked")}
+    assert counts == ({3} if experiment == "stage2" else {0})
 
 
 def test_an_unknown_part_is_an_error(make_module):

@@ -31,7 +31,6 @@ class Backbone(LiftingBackbone):
         start_levels: resolutions of a 3D encoder-decoder that the voxels pass before the first block; 0 for
             none, as in the paper.
         norm_momentum: as that of the image encoder, for the batch norms of that encoder-decoder.
-        freeze_norms: as in ``LiftingBackbone``.
         checkpoint_blocks: in training keep only what enters each block and compute the rest again for the
             backward pass: the same gradients, less memory, a forward pass of the blocks more.
 
@@ -51,10 +50,9 @@ class Backbone(LiftingBackbone):
         bidirectional: bool = True,
         start_levels: int = 0,
         norm_momentum: float = 0.1,
-        freeze_norms: bool = False,
         checkpoint_blocks: bool = False,
     ) -> None:
-        super().__init__(resnet=resnet, channels=channels, freeze_norms=freeze_norms)
+        super().__init__(resnet=resnet, channels=channels)
         if channels % num_heads or num_blocks < 1:
             raise ConfigError(
                 "backbone needs channels divisible by num_heads and a block at least, got "

@@ -9,7 +9,6 @@ import torch
 from torch import Tensor, nn
 
 from raytran.backbone.efficientnet import EfficientNetLite0
-from raytran.backbone.norms import keep_statistics
 from raytran.backbone.resnet import ResNet18
 from raytran.errors import ShapeError, check_shape
 from raytran.geometry.camera import Cameras
@@ -29,8 +28,6 @@ class LiftingBackbone(nn.Module, ABC):
     Args:
         resnet: the image encoder.
         channels: C of the 2D and 3D representations.
-        freeze_norms: train with the statistics that predictions use, and leave them as they are: a network
-            that is trained on, with few scenes a step, then learns with what it predicts with.
 
     Attributes:
         blocks: what mixes the two representations after the start; may be empty.
@@ -48,9 +45,8 @@ class LiftingBackbone(nn.Module, ABC):
     tracer: CenterTracer | None = None
     checkpoint_blocks: bool = False
 
-    def __init__(self, *, resnet: ImageEncoder, channels: int, freeze_norms: bool = False) -> None:
+    def __init__(self, *, resnet: ImageEncoder, channels: int) -> None:
         super().__init__()
-        self.freeze_norms = freeze_norms
         self.channels = channels
         self.resnet = resnet
         self.projection = nn.Linear(resnet.out_channels, channels)
@@ -58,13 +54,6 @@ class LiftingBackbone(nn.Module, ABC):
         shift, scale = [*resnet.image_mean, 0.0], [*resnet.image_std, 1.0]
         self.register_buffer("image_mean", torch.tensor(shift[: resnet.input_channels]), persistent=False)
         self.register_buffer("image_std", torch.tensor(scale[: resnet.input_channels]), persistent=False)
-
-    def train(self, mode: bool = True) -> LiftingBackbone:
-        """Set training mode, but for the batch norms if they are frozen."""
-        super().train(mode)
-        if self.freeze_norms:
-            keep_statistics(self)
-        return self
 
     @property
     def stride(self) -> int:

@@ -12,10 +12,3 @@ def set_momentum(network: nn.Module, momentum: float) -> None:
     for module in network.modules():
         if isinstance(module, _BatchNorm):
             module.momentum = momentum
-
-
-def keep_statistics(network: nn.Module) -> None:
-    """Let all batch norms of ``network`` use their statistics as they are; their scales still learn."""
-    for module in network.modules():
-        if isinstance(module, _BatchNorm):
-            module.eval()

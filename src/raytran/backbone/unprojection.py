@@ -29,7 +29,6 @@ class UnprojectionBackbone(LiftingBackbone):
         num_blocks: residual blocks at the voxels' own resolution.
         num_levels: resolutions, each half the one before; the coarser ones have one residual block each.
         norm_momentum: as that of the image encoder, for the batch norms over the voxels.
-        freeze_norms: as in ``LiftingBackbone``.
 
     Raises:
         ConfigError: there is no block, or no level.
@@ -43,9 +42,8 @@ class UnprojectionBackbone(LiftingBackbone):
         num_blocks: int = 4,
         num_levels: int = 3,
         norm_momentum: float = 0.1,
-        freeze_norms: bool = False,
     ) -> None:
-        super().__init__(resnet=resnet, channels=channels, freeze_norms=freeze_norms)
+        super().__init__(resnet=resnet, channels=channels)
         if num_blocks < 1 or num_levels < 1:
             raise ConfigError(
                 "unprojection backbone needs a block and a level at least, got "

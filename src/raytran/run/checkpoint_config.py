@@ -15,6 +15,9 @@ from raytran.errors import CheckpointError
 _MODULE = re.compile(r"raytran\.(model|backbone|heads)(\.[a-z_]+)*")
 """Where the parts of a network are defined."""
 
+_NOT_THE_NETWORK = ("attention", "freeze_norms")
+"""Settings beside those of the network: how it was computed there, and how older ones were trained."""
+
 _PLAIN = (str, int, float, bool, type(None))
 
 
@@ -53,7 +56,8 @@ def _build(node: Any, source: object) -> Any:
             return values
         if "weights" in values:
             values["weights"] = None  # they are in the checkpoint: nothing is to be read or fetched
-        values.pop("attention", None)  # it says how the network was computed there, not what it is
+        for name in _NOT_THE_NETWORK:
+            values.pop(name, None)
         return _class(node["_target_"], source)(**values)
     if isinstance(node, list | tuple):
         return [_build(value, source) for value in node]

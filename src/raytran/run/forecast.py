@@ -69,8 +69,7 @@ def training_bytes(model: RayTran, load: Load, stage: Stage, *, precision: str =
     def run(memory: LiveMemory) -> None:
         network = fake_copy(model)
         stage.freeze(network)
-        network.train()
-        stage.set_mode(network)
+        stage.set_modes(network)
         memory.track(list(network.parameters()))
         trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
         moments = [torch.empty_like(parameter) for parameter in trained for _ in range(2)]

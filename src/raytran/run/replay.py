@@ -57,8 +57,8 @@ def replay(cfg: DictConfig) -> Replayed:
         raise ConfigError(f"unknown precision={precision}: choose one of {', '.join(PRECISIONS)}")
     device = choose_device(cfg.device)
     model, loss, stage = _parts(content, path)
-    stage.freeze(model.to(device).train())
-    stage.set_mode(model)
+    stage.freeze(model.to(device))
+    stage.set_modes(model)
     found = run_step(
         model, loss, stage, [batch.to(device) for batch in batches], autocast=PRECISIONS[precision]
     )

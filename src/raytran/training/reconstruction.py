@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Self
+from typing import Any
 
 import lightning.pytorch as pl
 import torch
@@ -53,12 +53,6 @@ class Reconstruction(pl.LightningModule):
         self._compiled = torch.compile(model.forward) if compiled else None
         self.outcome: StepOutcome | None = None
         self._val_losses: dict[str, MeanMetric] = {}
-
-    def train(self, mode: bool = True) -> Self:
-        """Set the mode; frozen parts stay in evaluation mode whatever Lightning asks for."""
-        super().train(mode)
-        self.stage.set_mode(self.model)
-        return self
 
     def training_step(self, batch: SceneBatch, batch_idx: int) -> Tensor:
         """Return the loss to minimise; log its terms, means over all ranks."""

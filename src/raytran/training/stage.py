@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from torch import nn
+from torch.nn.modules.batchnorm import _BatchNorm
 
 from raytran.errors import ConfigError
 from raytran.model import RayTran
@@ -30,6 +31,8 @@ class Stage:
             evaluation mode, so that batch-norm statistics stay as they are.
         begins: names of the parts that start at random where the parent has none.
         new_views: frames of each scene that are held out to be rendered.
+        freeze_norms: train with the batch-norm statistics that predictions use, and leave them as they are. A
+            network that is trained on, with few scenes a step, then learns with what it predicts with.
     """
 
     name: str
@@ -44,6 +47,7 @@ class Stage:
     other_parents: Sequence[str] = ()
     begins: Sequence[str] = ()
     new_views: int = 0
+    freeze_norms: bool = False
 
     def freeze(self, model: RayTran) -> None:
         """Let gradients reach the parameters of ``model`` that train in this stage and no others.
@@ -57,16 +61,33 @@ class Stage:
         for part in self.trainable:
             if part not in names:
                 raise ConfigError(f"stage {self.name} trains '{part}', which the model does not have")
-        idle = model.idle_modules({*self.tasks, *self.terms})
+        idle = self._idle(model)
         for name, parameter in model.named_parameters():
             parameter.requires_grad_(_is_within(name, self.trainable) and not _is_within(name, idle))
 
-    def set_mode(self, model: nn.Module) -> None:
-        """Put every part of ``model`` that is frozen in evaluation mode; leave the others as they are."""
+    def training_modes(self, model: RayTran) -> list[tuple[nn.Module, bool]]:
+        """Return every module of ``model`` and whether it is in training mode during this stage.
+
+        Frozen parts are in evaluation mode, so that the statistics of their batch norms stay as they are, and
+        so are all batch norms if ``freeze_norms``.
+        """
+        idle = self._idle(model)
+        modes = []
         for name, module in model.named_modules():
-            holds_trainable = name == "" or any(part.startswith(f"{name}.") for part in self.trainable)
-            if not holds_trainable and not _is_within(name, self.trainable):
-                module.training = False
+            holds_trained = name == "" or any(part.startswith(f"{name}.") for part in self.trainable)
+            trained = _is_within(name, self.trainable) and not _is_within(name, idle)
+            keeps_statistics = self.freeze_norms and isinstance(module, _BatchNorm)
+            modes.append((module, (trained or holds_trained) and not keeps_statistics))
+        return modes
+
+    def set_modes(self, model: RayTran) -> None:
+        """Put every module of ``model`` in the mode of ``training_modes``."""
+        for module, training in self.training_modes(model):
+            module.training = training
+
+    def _idle(self, model: RayTran) -> tuple[str, ...]:
+        """Return the names of the parts of ``model`` that no gradient reaches in this stage."""
+        return model.idle_modules({*self.tasks, *self.terms})
 
 
 def _is_within(name: str, parts: Sequence[str]) -> bool:
