@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import pickle
 import shutil
+from itertools import islice
 
 import pytest
 import torch
@@ -18,6 +20,7 @@ from raytran.data.dataset import SceneDataset, scan2cad_dataset
 from raytran.data.scannet import load_views
 from raytran.errors import ConfigError, DataError
 from raytran.geometry.rotation import yaw_from_rotation
+from raytran.training.datamodule import SceneDataModule
 from raytran.types import SHAPE_SIZE
 
 SMALL = {"image_size": (32, 48), "num_views": 2, "grid_resolution": (8, 8, 4), "grid_extent": (8.0, 8.0, 4.0)}
@@ -98,23 +101,25 @@ def long_dataset(write_scan, write_cube, write_annotations, cube_entry, tmp_path
 def test_random_frames_depend_on_seed_epoch_and_index_alone(long_dataset) -> None:
     def frames(seed=0, epoch=0, index=0):
         dataset = open_dataset(long_dataset, num_views=6, targets=(), seed=seed)
-        dataset.set_epoch(epoch)
-        return dataset[index].frame_id[0]
+        return dataset[epoch, index].frame_id[0]
 
     assert frames() == frames()
     assert len({frames(), frames(seed=1), frames(epoch=1), frames(index=1)}) == 4
+    assert open_dataset(long_dataset, num_views=6, targets=())[1].frame_id[0] == frames(index=1)
 
 
 def test_workers_give_what_the_process_itself_gives_in_every_epoch(long_dataset) -> None:
     dataset = open_dataset(long_dataset, num_views=6)
     loader = DataLoader(
-        dataset, batch_size=2, num_workers=2, collate_fn=collate_scenes, persistent_workers=True
+        dataset,
+        sampler=[(epoch, index) for epoch in range(3) for index in range(2)],
+        batch_size=2,
+        num_workers=2,
+        collate_fn=collate_scenes,
     )
     seen = []
-    for epoch in range(3):
-        dataset.set_epoch(epoch)
-        (batch,) = loader
-        expected = collate_scenes([dataset[0], dataset[1]])
+    for epoch, batch in enumerate(loader):
+        expected = collate_scenes([dataset[epoch, 0], dataset[epoch, 1]])
         assert batch.frame_id == expected.frame_id
         assert torch.equal(batch.views.images, expected.views.images)
         assert torch.equal(batch.foreground, expected.foreground)
@@ -128,9 +133,7 @@ ALL = Augmentation(yaw_deg=180, shift=(0.5, 0.5, 0.2), mirror=0.5, brightness=0.
 
 def test_augmentation_depends_on_seed_epoch_and_index_alone(long_dataset) -> None:
     def sample(seed=0, epoch=0, index=0):
-        dataset = open_dataset(long_dataset, num_views=6, augmentation=ALL, seed=seed)
-        dataset.set_epoch(epoch)
-        return dataset[index]
+        return open_dataset(long_dataset, num_views=6, augmentation=ALL, seed=seed)[epoch, index]
 
     def state(sample):
         return [sample.views.images, sample.views.world_from_camera, sample.grid_center, sample.occupancy]
@@ -145,12 +148,36 @@ def test_augmentation_depends_on_seed_epoch_and_index_alone(long_dataset) -> Non
 
 def test_augmented_workers_give_what_the_process_itself_gives(long_dataset) -> None:
     dataset = open_dataset(long_dataset, num_views=6, augmentation=ALL)
-    dataset.set_epoch(3)
-    (batch,) = DataLoader(dataset, batch_size=2, num_workers=1, collate_fn=collate_scenes)
-    expected = collate_scenes([dataset[0], dataset[1]])
+    items = [(3, 0), (3, 1)]
+    (batch,) = DataLoader(dataset, sampler=items, batch_size=2, num_workers=1, collate_fn=collate_scenes)
+    expected = collate_scenes([dataset[item] for item in items])
     assert torch.equal(batch.views.images, expected.views.images)
     assert torch.equal(batch.views.world_from_camera, expected.views.world_from_camera)
     assert torch.equal(batch.occupancy, expected.occupancy)
+
+
+def test_batches_are_the_same_for_any_number_of_workers(long_dataset) -> None:
+    """Workers are in different epochs at the same time: two scenes have twenty ends of an epoch in forty."""
+
+    def digests(num_workers: int) -> list[str]:
+        data = SceneDataModule(
+            root=long_dataset,
+            dataset=lambda root, split, **options: open_dataset(root, **options),
+            targets=("occupancy",),
+            num_views=6,
+            num_workers=num_workers,
+            augmentation=ALL,
+        )
+        found = []
+        for batch in islice(data.train_dataloader(), 40):
+            parts = batch.views.images, batch.views.world_from_camera, batch.grid_center, batch.occupancy
+            found.append(hashlib.sha256(b"".join(part.numpy().tobytes() for part in parts)).hexdigest())
+        return found
+
+    expected = digests(0)
+    assert len(set(expected)) == 40
+    for num_workers in (1, 2, 4):
+        assert digests(num_workers) == expected
 
 
 def test_augmentation_that_is_off_is_none(long_dataset) -> None:
@@ -168,8 +195,7 @@ def test_augmentation_changes_neither_the_frames_drawn_nor_the_cached_masks(cube
         cube_dataset, view_choice="even", augmentation=Augmentation(mirror=1.0, yaw_deg=180)
     )
     for epoch in range(3):
-        dataset.set_epoch(epoch)
-        sample = dataset[0]
+        sample = dataset[epoch, 0]
         assert sample.frame_id == plain.frame_id
         assert torch.equal(sample.foreground, plain.foreground.flip(-1))
         assert sample.occupancy.any()
@@ -185,8 +211,7 @@ def test_dropout_keeps_the_number_of_images(cube_dataset) -> None:
 
 def test_dataset_can_be_pickled(long_dataset) -> None:
     dataset = open_dataset(long_dataset, num_views=6, targets=())
-    dataset.set_epoch(5)
-    assert pickle.loads(pickle.dumps(dataset))[0].frame_id == dataset[0].frame_id
+    assert pickle.loads(pickle.dumps(dataset))[5, 0].frame_id == dataset[5, 0].frame_id
 
 
 def test_annotation_is_read_once(long_dataset, monkeypatch) -> None:
@@ -329,9 +354,8 @@ def test_frames_to_render_change_with_the_epoch_and_with_the_scene(long_dataset)
     dataset = open_dataset(long_dataset, **options)
     first, again = dataset[0], dataset[0]
     assert torch.equal(first.new_views.world_from_camera, again.new_views.world_from_camera)
-    dataset.set_epoch(1)
-    assert not torch.equal(first.new_views.world_from_camera, dataset[0].new_views.world_from_camera)
-    batch = collate_scenes([dataset[0], dataset[1]])
+    assert not torch.equal(first.new_views.world_from_camera, dataset[1, 0].new_views.world_from_camera)
+    batch = collate_scenes([dataset[1, 0], dataset[1, 1]])
     assert batch.new_views.images.shape[:2] == (2, 2)
     # The cameras of a scan stand on a line, and still do after one change of the whole scene.
     line = torch.cat([first.views.world_from_camera, first.new_views.world_from_camera], dim=1)[0, :, :3, 3]

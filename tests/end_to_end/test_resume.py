@@ -123,6 +123,18 @@ def test_a_kill_anywhere(base, straight, tmp_path, monkeypatch, hook, call):
     assert_same(tmp_path / "run", straight)
 
 
+def test_a_kill_with_four_loader_workers_ends_as_a_run_without_any(base, tmp_path, monkeypatch):
+    changes = ["data.augmentation.yaw_deg=180", "data.augmentation.mirror=0.5"]
+    fit([*base, *changes, "views.num_workers=0"], tmp_path / "straight")
+    workers = [*base, *changes, "views.num_workers=4"]
+    with monkeypatch.context() as context:
+        kill_at(context, "training_step", 7)
+        with pytest.raises(Killed):
+            fit(workers, tmp_path / "run")
+    fit(workers, tmp_path / "run")
+    assert_same(tmp_path / "run", tmp_path / "straight")
+
+
 def send_at(monkeypatch, hook, call, signum):
     """Send this process a signal within the ``call``-th call of a method of the module."""
     original, calls = getattr(Reconstruction, hook), []

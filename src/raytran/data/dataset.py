@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -36,12 +36,26 @@ _DROPOUT, _AUGMENTATION, _HELD_OUT = 1, 2, 3
 """What randomness is for, besides the choice of frames."""
 
 
+class _Randomness(NamedTuple):
+    """What the random choices for one scene depend on."""
+
+    seed: int
+    epoch: int
+    scene: int
+
+    def generator(self, *purpose: int) -> torch.Generator:
+        """Return a source of random numbers, one for each purpose."""
+        state = np.random.SeedSequence([*self, *purpose]).generate_state(1, np.uint64)
+        return torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
+
+
 class SceneDataset(Dataset[SceneBatch]):
-    """Scans with their annotation; item i is a ``SceneBatch`` with B = 1.
+    """Scans with their annotation; item i, or (epoch, i), is a ``SceneBatch`` with B = 1.
 
     Nothing but the annotation is read before an item is asked for; targets are kept on disk, and in memory
     the cameras of the latest scans. So a data set is small, stays small, and is quick to send to the workers
-    of a ``DataLoader``. Random frames and augmentation depend on the seed, the epoch and the index alone.
+    of a ``DataLoader``. Random frames and augmentation depend on the seed, the epoch and the index alone; the
+    epoch comes with the index, so that workers which are in different epochs do not disturb each other.
     A scan of fewer than N frames gives some of them more than once, so all scenes have N images.
 
     Args:
@@ -106,8 +120,6 @@ class SceneDataset(Dataset[SceneBatch]):
         self._input_mask = input_mask
         self._augmentation = augmentation
         self._seed = seed
-        # In shared memory, so that workers which outlive an epoch see the next one.
-        self._epoch = torch.zeros((), dtype=torch.int64).share_memory_()
 
     def __len__(self) -> int:
         return len(self.scene_ids)
@@ -116,24 +128,25 @@ class SceneDataset(Dataset[SceneBatch]):
         """Return how many objects scene ``index`` has, without reading the scene."""
         return len(self._objects_of[index])
 
-    def set_epoch(self, epoch: int) -> None:
-        """Choose the random frames of another epoch; call it before the loader's iterator is made."""
-        self._epoch.fill_(epoch)
+    def __getitem__(self, item: int | tuple[int, int]) -> SceneBatch:
+        """Return a scene with B = 1.
 
-    def __getitem__(self, index: int) -> SceneBatch:
-        """Return scene ``index`` with B = 1.
+        Args:
+            item: index of the scene, or (epoch, index); without an epoch it is 0.
 
         Raises:
             DataError: the scan, its images or the CAD models cannot be read.
         """
+        epoch, index = item if isinstance(item, tuple) else (0, item)
+        randomness = _Randomness(self._seed, epoch, index)
         scan = self._scans[self.scene_ids[index]]
         views, used = scan_views(
-            scan, self._choose(len(scan), index), image_size=self._image_size, min_views=self._min_views
+            scan, self._choose(len(scan), randomness), image_size=self._image_size, min_views=self._min_views
         )
-        seen, rendered = self._hold_out(used, index)
+        seen, rendered = self._hold_out(used, randomness)
         scene = self._scene(scan, views, used, seen, self._with_shapes(self._objects_of[index]))
         if self._augmentation is not None:
-            scene = self._augmentation(scene, self._generator(index, _AUGMENTATION))
+            scene = self._augmentation(scene, randomness.generator(_AUGMENTATION))
         if rendered:
             scene = _divided(scene, seen, rendered)
         objects = () if scene.objects is None else scene.objects
@@ -163,27 +176,21 @@ class SceneDataset(Dataset[SceneBatch]):
             foreground=foreground,
         )
 
-    def _choose(self, n: int, index: int) -> list[int]:
+    def _choose(self, n: int, randomness: _Randomness) -> list[int]:
         if self._view_choice == "even":
             chosen = choose_even(n, self._num_views).tolist()
         else:
-            chosen = choose_random(n, self._num_views, self._generator(index)).tolist()
+            chosen = choose_random(n, self._num_views, randomness.generator()).tolist()
         if self._augmentation is None:
             return chosen
-        return self._augmentation.drop_frames(chosen, self._min_views, self._generator(index, _DROPOUT))
+        return self._augmentation.drop_frames(chosen, self._min_views, randomness.generator(_DROPOUT))
 
-    def _hold_out(self, used: Sequence[int], index: int) -> tuple[list[int], list[int]]:
+    def _hold_out(self, used: Sequence[int], randomness: _Randomness) -> tuple[list[int], list[int]]:
         """Return the places of the frames to see and to render."""
         if not self._num_new_views:
             return list(range(len(used))), []
-        generator = None if self._view_choice == "even" else self._generator(index, _HELD_OUT)
+        generator = None if self._view_choice == "even" else randomness.generator(_HELD_OUT)
         return hold_out(used, self._num_new_views, generator)
-
-    def _generator(self, index: int, *purpose: int) -> torch.Generator:
-        """Return the source of randomness of scene ``index`` in this epoch, one for each purpose."""
-        seeds = np.random.SeedSequence([self._seed, int(self._epoch), index, *purpose])
-        state = seeds.generate_state(1, np.uint64)
-        return torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
 
     def _with_shapes(self, objects: ObjectSet) -> ObjectSet:
         if self._shapenet_root is None or not self._targets & {"shapes", "occupancy"}:

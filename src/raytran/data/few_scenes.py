@@ -27,11 +27,9 @@ class FewScenes(Dataset[SceneBatch]):
     def __len__(self) -> int:
         return self._length
 
-    def set_epoch(self, epoch: int) -> None:
-        """Do nothing: every epoch has the same frames."""
-
-    def __getitem__(self, index: int) -> SceneBatch:
-        """Return scene ``index`` with B = 1."""
+    def __getitem__(self, item: int | tuple[int, int]) -> SceneBatch:
+        """Return scene ``item``, or of (epoch, index) the scene ``index``, with B = 1."""
+        index = item[1] if isinstance(item, tuple) else item
         if not 0 <= index < self._length:
             raise IndexError(f"scene {index} of {self._length}")
         return self._dataset[index]

@@ -26,7 +26,7 @@ class SceneDataModule(pl.LightningDataModule):
     Args:
         root: folder with ``scannet``, ``scan2cad`` and ``shapenet``.
         dataset: ``dataset(root=…, split="train"|"val", view_choice=…, num_views=…, targets=…,
-            augmentation=…)``.
+            augmentation=…)``; validation asks the result for ``[index]``, training for ``[epoch, index]``.
         targets: what batches must hold, see ``SceneDataset``.
         make: ``make(output=root)`` writes the data and does nothing where they are complete; None if they are
             there in any case.
@@ -95,7 +95,7 @@ class SceneDataModule(pl.LightningDataModule):
 
     def train_dataloader(self) -> DataLoader[SceneBatch]:
         """Return the training scenes without end, in an order that changes every epoch."""
-        dataset = _ByEpoch(self.split("train", training=True))
+        dataset = self.split("train", training=True)
         stream = SceneStream(
             dataset,
             **self._ranks(),
@@ -133,18 +133,3 @@ class SceneDataModule(pl.LightningDataModule):
         if self.trainer is None:
             return {"num_replicas": 1, "rank": 0}
         return {"num_replicas": self.trainer.world_size, "rank": self.trainer.global_rank}
-
-
-class _ByEpoch(Dataset[SceneBatch]):
-    """A data set asked by (epoch, index)."""
-
-    def __init__(self, dataset: Any) -> None:
-        self._dataset = dataset
-
-    def __len__(self) -> int:
-        return len(self._dataset)
-
-    def __getitem__(self, item: tuple[int, int]) -> SceneBatch:
-        epoch, index = item
-        self._dataset.set_epoch(epoch)
-        return self._dataset[index]
