@@ -68,6 +68,16 @@ def test_two_ranks_share_one_folder_a_stage(curriculum):
 
 
 @pytest.mark.slow
+def test_ranks_share_the_batch_norms_of_voxels_too(steps, tmp_path, command):
+    """The ranks' networks are compared at every validation; one that differs stops the command."""
+    arguments = [*steps, "trainer=ddp_cpu", "experiment=unprojection_stage1", "output_dir=run"]
+    done = command("train", *arguments, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    state = torch.load(tmp_path / "run" / LAST, weights_only=True)["state_dict"]
+    assert int(state["model.backbone.volume.down.0.0.bn1.num_batches_tracked"]) == STEPS
+
+
+@pytest.mark.slow
 def test_torchruns_ranks_share_one_folder(steps, tmp_path):
     """Each is a command of its own, with a clock of its own."""
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]

@@ -21,10 +21,24 @@ from raytran.run.build import build_model, build_module
 from raytran.run.entry import compose
 from raytran.training.callbacks.rank_agreement import RankAgreement
 from raytran.training.callbacks.stage_setup import StageSetup
-from raytran.training.ranks import BatchNormOverRanks, SyncedBatchNorm, agree, mean_over_ranks
+from raytran.training.ranks import (
+    BatchNorm1dOverRanks,
+    BatchNorm2dOverRanks,
+    BatchNorm3dOverRanks,
+    SyncedBatchNorm,
+    agree,
+    mean_over_ranks,
+)
 from raytran.types import ObjectSet
 
-STAGES = ("stage1", "stage2", "stage3")
+RUNS = {
+    "stage1": ("experiment=stage1",),
+    "stage2": ("experiment=stage2",),
+    "stage3": ("experiment=stage3",),
+    "voxels normalised": ("experiment=stage1", "model.backbone.start_levels=2"),
+    "no attention": ("experiment=unprojection_stage1",),
+}
+"""The runs that ranks are compared in, and their settings."""
 STEPS = 5
 SETTINGS = [
     "preset=tiny",
@@ -85,10 +99,10 @@ def free_port():
         return str(listener.getsockname()[1])
 
 
-def fit(experiment, batches, **settings):
+def fit(run, batches, **settings):
     """Return the weights after a few steps, and what was left without a gradient."""
     torch.manual_seed(0)
-    cfg = compose("train", [*SETTINGS, f"experiment={experiment}"])
+    cfg = compose("train", [*SETTINGS, *RUNS[run]])
     module = build_module(cfg, build_model(cfg).double())
     idle = IdleParameters()
     trainer = pl.Trainer(
@@ -127,14 +141,14 @@ def normalize(images, norm):
 
 @pytest.mark.slow
 def test_two_ranks_and_an_empty_scene_take_the_step_of_one_rank(scenes, two_ranks):
-    for stage in STAGES:
-        one = fit(stage, [collate_scenes(step) for step in scenes])
-        assert one["idle"] == two_ranks[0][stage]["idle"] == two_ranks[1][stage]["idle"] == []
+    for run in RUNS:
+        one = fit(run, [collate_scenes(step) for step in scenes])
+        assert one["idle"] == two_ranks[0][run]["idle"] == two_ranks[1][run]["idle"] == []
         for name, value in one["weights"].items():
-            first, second = (rank[stage]["weights"][name] for rank in two_ranks)
+            first, second = (rank[run]["weights"][name] for rank in two_ranks)
             assert torch.equal(first, second), name
             # Proposals and poses leave their layers as float32; measured: 1.1e-9 (learning rate 1e-3).
-            assert torch.allclose(first, value, rtol=0, atol=1e-8), (stage, name)
+            assert torch.allclose(first, value, rtol=0, atol=1e-8), (run, name)
     norm = nn.BatchNorm2d(3)
     images = torch.randn(2, 3, 4, 5, generator=torch.Generator().manual_seed(0))
     # Each rank weighs its outputs anew from the start: one process has to do the same.
@@ -161,20 +175,33 @@ def test_one_rank_is_its_own_mean():
     assert agree([values], torch.device("cpu"))
 
 
-def test_batch_norm_is_exchanged_and_given_back():
-    model = nn.Sequential(nn.BatchNorm2d(3), nn.Sequential(nn.BatchNorm2d(2)))
-    for on_cpu, kind in ((True, BatchNormOverRanks), (False, nn.SyncBatchNorm)):
-        sync = SyncedBatchNorm(on_cpu=on_cpu)
-        changed = sync.apply(model)
-        assert [type(changed[0]), type(changed[1][0])] == [kind, kind]
-        given_back = sync.revert(changed)
-        assert not any(isinstance(m, kind) for m in given_back.modules())
-        assert list(given_back.state_dict()) == list(model.state_dict())
+KINDS = {
+    nn.BatchNorm1d: BatchNorm1dOverRanks,
+    nn.BatchNorm2d: BatchNorm2dOverRanks,
+    nn.BatchNorm3d: BatchNorm3dOverRanks,
+}
 
 
-def test_alone_the_batch_norm_is_pytorchs():
-    images = torch.randn(4, 3, 5, 6, generator=torch.Generator().manual_seed(0)).mul(3).add(1)
-    ours, theirs = BatchNormOverRanks(3), nn.BatchNorm2d(3)
+def test_batch_norms_are_exchanged_and_given_back():
+    model = nn.Sequential(nn.Sequential(nn.BatchNorm1d(4)), nn.BatchNorm2d(3), nn.BatchNorm3d(2))
+    norms = [model[0][0], model[1], model[2]]
+    sync = SyncedBatchNorm(on_cpu=True)
+    assert sync.apply(model) is model
+    assert [type(norm) for norm in norms] == list(KINDS.values())
+    assert sync.revert(model) is model
+    assert [type(norm) for norm in norms] == list(KINDS)
+    sync = SyncedBatchNorm(on_cpu=False)
+    changed = sync.apply(model)
+    assert {type(m) for m in (changed[0][0], changed[1], changed[2])} == {nn.SyncBatchNorm}
+    given_back = sync.revert(changed)
+    assert not any(isinstance(m, nn.SyncBatchNorm) for m in given_back.modules())
+    assert list(given_back.state_dict()) == list(model.state_dict())
+
+
+@pytest.mark.parametrize(("usual", "size"), list(zip(KINDS, [(7,), (5, 6), (3, 4, 2)], strict=True)))
+def test_alone_the_batch_norm_is_pytorchs(usual, size):
+    images = torch.randn(4, 3, *size, generator=torch.Generator().manual_seed(0)).mul(3).add(1)
+    ours, theirs = KINDS[usual](3), usual(3)
     for a, b in zip(normalize(images, ours), normalize(images, theirs), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5)
     torch.testing.assert_close(ours.eval()(images), theirs.eval()(images), rtol=1e-5, atol=1e-5)
@@ -184,12 +211,12 @@ def run_rank(folder):
     rank = int(os.environ["RANK"])
     batches = [step[rank] for step in torch.load(folder / "scenes.pt", weights_only=False)]
     found = {}
-    for stage in STAGES:
+    for run in RUNS:
         plugins = [SyncedBatchNorm(on_cpu=True)]
         strategy = DDPStrategy(process_group_backend="gloo")
-        found[stage] = fit(stage, batches, devices=2, strategy=strategy, plugins=plugins)
+        found[run] = fit(run, batches, devices=2, strategy=strategy, plugins=plugins)
     images = torch.randn(2, 3, 4, 5, generator=torch.Generator().manual_seed(0))[rank : rank + 1]
-    found["norm"] = normalize(images, BatchNormOverRanks(3))
+    found["norm"] = normalize(images, BatchNorm2dOverRanks(3))
     found["mean"] = mean_over_ranks(torch.tensor([float(rank), 10.0]))
     here, values = torch.device("cpu"), [torch.arange(5.0), torch.ones(2).bfloat16(), torch.tensor(3)]
     found["same"] = agree(values, here)

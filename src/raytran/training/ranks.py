@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
 import torch.distributed as dist
 from lightning.pytorch.plugins.layer_sync import TorchSyncBatchNorm
 from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
 
 _INTEGER = {1: torch.uint8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
 
@@ -45,7 +46,7 @@ def agree(tensors: Iterable[Tensor], device: torch.device) -> bool:
 
 
 class SyncedBatchNorm(TorchSyncBatchNorm):
-    """Batch norm over the images of all ranks, on GPUs by PyTorch's own and on CPUs too.
+    """Batch norm over the images, or voxels, of all ranks: on GPUs by PyTorch's own and on CPUs too.
 
     With statistics of each rank's own, ranks of one scene would normalise otherwise than one rank of several
     does, and end with running statistics that differ.
@@ -61,38 +62,41 @@ class SyncedBatchNorm(TorchSyncBatchNorm):
         """Return the model with its batch norms exchanged."""
         if not self._on_cpu:
             return super().apply(model)
-        return _exchange(model, nn.BatchNorm2d, BatchNormOverRanks)
+        return _exchange(model, _OVER_RANKS)
 
     def revert(self, model: nn.Module) -> nn.Module:
         """Return the model with usual batch norms."""
-        return super().revert(_exchange(model, BatchNormOverRanks, nn.BatchNorm2d))
+        return super().revert(_exchange(model, {ours: usual for usual, ours in _OVER_RANKS.items()}))
 
 
-def _exchange(model: nn.Module, kind: type[nn.Module], wanted: type[nn.Module]) -> nn.Module:
-    """Let modules of one kind be of another, which has the same parameters and buffers."""
+def _exchange(model: nn.Module, kinds: Mapping[type[nn.Module], type[nn.Module]]) -> nn.Module:
+    """Give modules another class, one that has the same parameters and buffers and differs in ``forward``."""
     for module in model.modules():
-        if type(module) is kind:
-            module.__class__ = wanted
+        if type(module) in kinds:
+            module.__class__ = kinds[type(module)]
     return model
 
 
-class BatchNormOverRanks(nn.BatchNorm2d):
+class _NormOverRanks(_BatchNorm):
     """``SyncBatchNorm`` in plain operations, for the CPU, on which PyTorch's refuses to work."""
 
     def forward(self, input: Tensor) -> Tensor:
-        """Normalise ``(n, C, H, W)``."""
+        """Normalise ``(n, C, ...)``."""
         if not self.training:
             return super().forward(input)
         exact = input.double()
-        axes, count = (0, 2, 3), exact.new_full(input.shape[1:2], input.numel() / input.shape[1])
+        axes, count = (
+            (0, *range(2, input.ndim)),
+            exact.new_full(input.shape[1:2], input.numel() / input.shape[1]),
+        )
         sums = torch.stack([exact.sum(axes), exact.square().sum(axes), count])
         total, squares, count = _SumOverRanks.apply(sums).unbind()
         mean = total / count
         variance = (squares / count - mean.square()).clamp(min=0)
         self._remember(mean.detach(), (variance * count / (count - 1)).detach())
         scale = self.weight * (variance + self.eps).rsqrt()
-        normalized = (exact - mean[:, None, None]) * scale[:, None, None] + self.bias[:, None, None]
-        return normalized.to(input.dtype)
+        mean, scale, bias = (x.view(-1, *(1,) * (input.ndim - 2)) for x in (mean, scale, self.bias))
+        return ((exact - mean) * scale + bias).to(input.dtype)
 
     def _remember(self, mean: Tensor, variance: Tensor) -> None:
         if self.running_mean is None or self.running_var is None or self.num_batches_tracked is None:
@@ -101,6 +105,25 @@ class BatchNormOverRanks(nn.BatchNorm2d):
         momentum = 1.0 / float(self.num_batches_tracked) if self.momentum is None else self.momentum
         self.running_mean.lerp_(mean.to(self.running_mean.dtype), momentum)
         self.running_var.lerp_(variance.to(self.running_var.dtype), momentum)
+
+
+class BatchNorm1dOverRanks(_NormOverRanks, nn.BatchNorm1d):
+    """``nn.BatchNorm1d`` over all ranks."""
+
+
+class BatchNorm2dOverRanks(_NormOverRanks, nn.BatchNorm2d):
+    """``nn.BatchNorm2d`` over all ranks."""
+
+
+class BatchNorm3dOverRanks(_NormOverRanks, nn.BatchNorm3d):
+    """``nn.BatchNorm3d`` over all ranks."""
+
+
+_OVER_RANKS: dict[type[nn.Module], type[nn.Module]] = {
+    nn.BatchNorm1d: BatchNorm1dOverRanks,
+    nn.BatchNorm2d: BatchNorm2dOverRanks,
+    nn.BatchNorm3d: BatchNorm3dOverRanks,
+}
 
 
 class _SumOverRanks(torch.autograd.Function):
