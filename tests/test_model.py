@@ -58,7 +58,7 @@ def make_model(
             widths=widths,
         ),
     }
-    resnet = ResNet18(width=4, stride=stride, input_channels=input_channels)
+    resnet = ResNet18(width=8, stride=stride, input_channels=input_channels)
     backbone = Backbone(resnet=resnet, channels=CHANNELS, num_heads=2, num_blocks=2, expansion=1)
     return RayTran(backbone=backbone, heads=heads, grid_resolution=RESOLUTION, grid_extent=EXTENT)
 

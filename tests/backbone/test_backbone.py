@@ -18,7 +18,7 @@ from raytran.ops.splat import splat_features
 
 def make_backbone(num_blocks: int = 1) -> Backbone:
     torch.manual_seed(0)
-    return Backbone(resnet=ResNet18(width=4), channels=8, num_heads=2, num_blocks=num_blocks).eval()
+    return Backbone(resnet=ResNet18(width=8), channels=8, num_heads=2, num_blocks=num_blocks).eval()
 
 
 def scene(center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> dict[str, Any]:
@@ -123,7 +123,7 @@ def test_start_levels_run_before_the_first_block_and_leave_the_rest_as_it_was() 
     def make(start_levels: int) -> Backbone:
         torch.manual_seed(0)
         return Backbone(
-            resnet=ResNet18(width=4), channels=8, num_heads=2, num_blocks=1, start_levels=start_levels
+            resnet=ResNet18(width=8), channels=8, num_heads=2, num_blocks=1, start_levels=start_levels
         ).eval()
 
     plain, deep = make(0), make(2)
@@ -144,12 +144,12 @@ def test_start_levels_run_before_the_first_block_and_leave_the_rest_as_it_was() 
 
 def test_start_levels_are_not_negative() -> None:
     with pytest.raises(ConfigError, match="start_levels must be 0 or more, got -1"):
-        Backbone(resnet=ResNet18(width=4), channels=8, num_heads=2, num_blocks=1, start_levels=-1)
+        Backbone(resnet=ResNet18(width=8), channels=8, num_heads=2, num_blocks=1, start_levels=-1)
 
 
 def test_channels_must_split_into_heads() -> None:
     with pytest.raises(ConfigError, match="num_heads=3"):
-        Backbone(resnet=ResNet18(width=4), channels=16, num_heads=3)
+        Backbone(resnet=ResNet18(width=8), channels=16, num_heads=3)
 
 
 def test_checkpointed_blocks_give_the_same_gradients_from_less_memory() -> None:

@@ -18,7 +18,7 @@ from raytran.ops.traverse import trace_pairs
 
 def make_backbone(num_blocks: int = 2) -> Backbone:
     torch.manual_seed(0)
-    backbone = Backbone(resnet=ResNet18(width=4), channels=16, num_heads=2, num_blocks=num_blocks).eval()
+    backbone = Backbone(resnet=ResNet18(width=8), channels=16, num_heads=2, num_blocks=num_blocks).eval()
     # Scores far from equal, so that a wrong weight between chunks shows.
     for block in backbone.blocks:
         torch.nn.init.normal_(block.voxel_stream.query.weight)

@@ -19,7 +19,7 @@ from raytran.ops.traverse import trace_pairs
 def run(generator):
     """Run a small backbone on three views, all at once or two at a time."""
     torch.manual_seed(0)
-    backbone = Backbone(resnet=ResNet18(width=4), channels=8, num_heads=2, num_blocks=2).eval()
+    backbone = Backbone(resnet=ResNet18(width=8), channels=8, num_heads=2, num_blocks=2).eval()
     pose = torch.eye(4).repeat(1, 3, 1, 1)
     pose[..., :3, 3] = torch.rand(1, 3, 3, generator=generator)
     intrinsics = torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]).expand(1, 3, 3, 3)

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 from urllib.error import URLError
 
@@ -123,3 +126,23 @@ def test_missing_damaged_and_foreign_files(tmp_path: Path) -> None:
 def test_pretrained_weights_have_one_width() -> None:
     with pytest.raises(ConfigError, match="width 64, got 16"):
         ResNet18(width=16, weights="imagenet")
+
+
+def test_a_width_that_corrupts_memory_on_some_processors_is_refused() -> None:
+    with pytest.raises(ConfigError, match="resnet width must be 8 or more, got 4"):
+        ResNet18(width=4)
+
+
+def test_the_smallest_width_leaves_the_memory_whole_on_a_processor_without_avx_512() -> None:
+    script = """
+import torch
+from raytran.backbone.resnet import MIN_WIDTH, ResNet18
+network = ResNet18(width=MIN_WIDTH)
+for _ in range(20):
+    network(torch.randn(2, 3, 32, 48)).sum().backward()
+"""
+    slow = {"ONEDNN_MAX_CPU_ISA": "AVX2", "OMP_NUM_THREADS": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=os.environ | slow, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr

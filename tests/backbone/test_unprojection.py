@@ -21,7 +21,7 @@ from raytran.ops.pairs import PairList
 def make_backbone(num_levels: int = 3) -> UnprojectionBackbone:
     torch.manual_seed(0)
     return UnprojectionBackbone(
-        resnet=ResNet18(width=4), channels=8, num_blocks=1, num_levels=num_levels
+        resnet=ResNet18(width=8), channels=8, num_blocks=1, num_levels=num_levels
     ).eval()
 
 
@@ -115,7 +115,7 @@ def test_gradients_reach_all_that_is_not_idle(generator: torch.Generator, with_p
 
 
 def test_norms_over_the_voxels_remember_as_they_are_told(generator: torch.Generator) -> None:
-    network = UnprojectionBackbone(resnet=ResNet18(width=4), channels=8, num_blocks=1, norm_momentum=0.25)
+    network = UnprojectionBackbone(resnet=ResNet18(width=8), channels=8, num_blocks=1, norm_momentum=0.25)
     norm = network.volume.down[0][0].bn1
     voxels = torch.rand(1, 6, 6, 6, 8, generator=generator)
     convolved = network.volume.down[0][0].conv1(voxels.movedim(-1, 1))
@@ -127,4 +127,4 @@ def test_norms_over_the_voxels_remember_as_they_are_told(generator: torch.Genera
 @pytest.mark.parametrize("wrong", [{"num_blocks": 0}, {"num_levels": 0}])
 def test_nothing_is_refused(wrong: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match="a block and a level"):
-        UnprojectionBackbone(resnet=ResNet18(width=4), channels=8, **wrong)
+        UnprojectionBackbone(resnet=ResNet18(width=8), channels=8, **wrong)

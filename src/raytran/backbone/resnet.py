@@ -17,6 +17,12 @@ IMAGENET_URL = "https://download.pytorch.org/models/resnet18-f37072fd.pth"
 """torchvision's ``ResNet18_Weights.IMAGENET1K_V1``; the name carries the first digits of its SHA-256."""
 
 
+MIN_WIDTH = 8
+"""Fewest channels of a stage. With fewer, the gradient of the strided 1×1 convolution behind the first stage
+writes beyond its memory on CPUs without AVX-512 (oneDNN in torch 2.13, channels-last), which ends the process
+somewhere later."""
+
+
 class BasicBlock(nn.Module):
     """Two 3×3 convolutions with a skip."""
 
@@ -45,7 +51,8 @@ class ResNet18(nn.Module):
     The last stage keeps its resolution, so the output has stride 16: 640×480 gives the paper's 40×30.
 
     Args:
-        width: channels of the first stage; 64 is ResNet-18, the output has ``8 · width``.
+        width: channels of the first stage, ``MIN_WIDTH`` at least; 64 is ResNet-18, the output has
+            ``8 · width``.
         stride: image pixels along each side of a feature cell, 16 (the paper) or 8, where the third stage
             keeps its resolution too: small images then keep more cells.
         norm_momentum: share of each batch in the running statistics that batch norms predict with; a tenth
@@ -57,7 +64,8 @@ class ResNet18(nn.Module):
             torchvision's names, with or without ``fc``. Needed only at construction.
 
     Raises:
-        ConfigError: weights are given for another width, or the stride is neither 16 nor 8.
+        ConfigError: the width is too small, weights are given for another width than 64, or the stride is
+            neither 16 nor 8.
         CheckpointError: the weights cannot be fetched, read, or do not fit.
     """
 
@@ -75,6 +83,8 @@ class ResNet18(nn.Module):
         weights: str | Path | None = None,
     ) -> None:
         super().__init__()
+        if width < MIN_WIDTH:
+            raise ConfigError(f"resnet width must be {MIN_WIDTH} or more, got {width}")
         if stride not in (8, 16):
             raise ConfigError(f"resnet stride must be 8 or 16, got {stride}")
         self.stride = stride
