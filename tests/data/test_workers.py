@@ -46,21 +46,22 @@ def test_a_worker_that_is_killed_is_one_sentence():
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="needs Linux to look at processes")
-def test_processes_end_with_a_parent_that_is_killed():
+def test_processes_end_with_a_parent_that_is_killed(tmp_path):
+    # They watch their parent once they have started to work, which a file says.
+    mark = f"pathlib.Path({str(tmp_path)!r}, str(os.getpid())).touch()"
+    work = f"import os, pathlib, time; {mark}; time.sleep(600)"
     code = (
-        "import time\nfrom raytran.data.workers import work_on\n"
+        "from raytran.data.workers import work_on\n"
         "if __name__ == '__main__':\n"
-        "    list(work_on([60, 60], time.sleep, label='x', processes=2, progress=False))\n"
+        f"    list(work_on([{work!r}] * 2, exec, label='x', processes=2, progress=False))\n"
     )
     parent = subprocess.Popen([sys.executable, "-c", code])
     try:
-        workers = wait_for(lambda: [pid for pid in children(parent.pid) if "spawn_main" in command(pid)], 2)
-        # They watch their parent only once they have started to work.
-        time.sleep(1)
+        workers = wait_for(lambda: [int(path.name) for path in tmp_path.iterdir()], 2)
     finally:
         parent.send_signal(signal.SIGKILL)
         parent.wait()
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + 60
     while any(running(pid) for pid in workers) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not any(running(pid) for pid in workers)
@@ -74,19 +75,6 @@ def wait_for(look, count):
             return found
         time.sleep(0.05)
     raise TimeoutError
-
-
-def children(pid):
-    with open(f"/proc/{pid}/task/{pid}/children") as file:
-        return [int(word) for word in file.read().split()]
-
-
-def command(pid):
-    try:
-        with open(f"/proc/{pid}/cmdline") as file:
-            return file.read()
-    except OSError:
-        return ""
 
 
 def running(pid):
