@@ -3,6 +3,9 @@
 
 Its block mask lists the 128×128 blocks of the attention matrix in which there is a pair; inside of them a
 slab test of each ray of a pixel against a voxel's box says which pairs there are. In float32.
+
+Compiled anew for each case and for its sizes alone: one compiled function for all of them passes torch's
+limit of recompilations and then runs uncompiled, which makes the whole matrix and is no FlexAttention.
 """
 
 from __future__ import annotations
@@ -20,8 +23,6 @@ from raytran.ops.ray_attention import Direction
 from raytran.ops.traverse import voxel_rays
 
 BLOCK = 128
-
-_compiled = torch.compile(flex_attention)
 
 
 def flex_ray_attention(
@@ -50,9 +51,13 @@ def flex_ray_attention(
         target, source, targets, sources, _meets(cameras, grid, feature_size, direction, rays_per_cell)
     )
 
+    torch._dynamo.reset()
+    # fullgraph: what cannot be compiled raises instead of running as it is.
+    compiled = torch.compile(flex_attention, fullgraph=True, dynamic=False)
+
     def attend(query: Tensor, key: Tensor, value: Tensor) -> Tensor:
         heads_first = (x.transpose(0, 1)[None] for x in (query, key, value))
-        return _compiled(*heads_first, block_mask=mask)[0].transpose(0, 1)
+        return compiled(*heads_first, block_mask=mask)[0].transpose(0, 1)
 
     return attend
 

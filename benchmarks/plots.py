@@ -41,20 +41,22 @@ def draw_all(folder: Path) -> None:
 def draw_curves(rows: Sequence[Row], axis: str, path: Path, *, title: str) -> None:
     """Draw time and peak memory against ``axis``, a curve per candidate, on logarithmic scales."""
     figure, panels = plt.subplots(1, 2, figsize=(10, 4), layout="constrained")
+    memory = "extra_mib" if "extra_mib" in rows[0] else "peak_mib"
+    beyond = "MiB beyond inputs and outputs" if memory == "extra_mib" else "MiB beyond the inputs"
     groups = dict.fromkeys(tuple(row.get(key, "") for key in ("what", "direction", "dtype")) for row in rows)
     for group in groups:
         same = [
             row for row in rows if tuple(row.get(key, "") for key in ("what", "direction", "dtype")) == group
         ]
         label = ", ".join(part.replace("_", " ") for part in group if part)
-        for panel, column, factor in ((panels[0], "seconds", 1e3), (panels[1], "peak_mib", 1.0)):
+        for panel, column, factor in ((panels[0], "seconds", 1e3), (panels[1], memory, 1.0)):
             points = sorted(
                 (float(row[axis]), factor * float(row[column])) for row in same if row.get(column)
             )
             points = [point for point in points if point[1] > 0]
             if points:
                 panel.plot(*zip(*points, strict=True), marker="o", label=label)
-    for panel, name in zip(panels, ("milliseconds", "MiB beyond the inputs"), strict=True):
+    for panel, name in zip(panels, ("milliseconds", beyond), strict=True):
         panel.set(xscale="log", yscale="log", xlabel=axis, ylabel=name)
         panel.grid(which="both", alpha=0.3)
     panels[0].legend(fontsize="x-small")
@@ -64,7 +66,7 @@ def draw_curves(rows: Sequence[Row], axis: str, path: Path, *, title: str) -> No
 
 def draw_parts(rows: Sequence[Row], path: Path) -> None:
     """Draw what each part of a step takes, and the least that it could."""
-    parts = [row for row in rows if row.get("floor_s")][::-1]
+    parts = [row for row in rows if row.get("floor_s") and row.get("seconds")][::-1]
     if not parts:
         return
     figure, panel = plt.subplots(figsize=(8, 0.35 * len(parts) + 1.2), layout="constrained")

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Prediction in chunks of views, and the planner's forecast of it: ``python benchmarks/prediction.py``.
 
-Each size runs in a process of its own, so that no peak hides in memory that an earlier one left behind.
+Each size runs in a process of its own, so that no peak hides in memory that an earlier one left behind, and
+none ends the others. The peak is that of everything on the device, weights and images included.
 """
 
 from __future__ import annotations
@@ -10,50 +11,62 @@ import argparse
 import json
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import torch
 from camera_path import add_arguments, cameras_of
+from device import Device, this_device
 from record import write_rows
-from timing import peak_mebibytes, print_machine
+from step import load_of
+from timing import MEBIBYTE, print_machine, reason
 
-from raytran.geometry.grid import VoxelGrid
+from raytran.geometry.camera import Cameras
 from raytran.run.build import build_model
 from raytran.run.entry import compose
-from raytran.run.forecast import Load, prediction_bytes
+from raytran.run.forecast import prediction_bytes
 from raytran.run.plan import FIXED, SCRATCH
 from raytran.types import Views
 
 
-def measure(arguments: argparse.Namespace, views: int, views_at_once: int | None) -> dict[str, object]:
-    """Predict once from random images; return peak and time."""
-    settings = [f"preset={arguments.preset}", "output_dir=unused", *arguments.settings]
-    cfg = compose("train", [*settings, "model.backbone.resnet.weights=null"])
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    model, size = build_model(cfg).eval(), tuple(cfg.views.image_size)
-    cameras = cameras_of(arguments, views).scaled_to(size)
-    grid = VoxelGrid(model.grid_resolution, model.grid_extent, cameras.position.mean(dim=0))
-    few = cameras_of(arguments, 8).scaled_to(size)
-    traced = model.ray_tracer(few, grid, (size[0] // 16, size[1] // 16), model.rays_per_cell)
-    per_pixel = len(traced) / traced.num_pixels
-    load = Load(1, views, size, per_pixel, fused=device.type == "cuda")
-    forecast = prediction_bytes(model, load, views_at_once=views_at_once)
+def predict_once(
+    preset: str,
+    settings: list[str],
+    cameras: Cameras,
+    views_at_once: int | None,
+    device: Device,
+) -> dict[str, object]:
+    """Predict from random images, once on a device that is empty before; return peak, forecast and time.
+
+    The peak has weights and images in it. The time is that of a second prediction.
+    """
+    held = device.held()
+    cfg = compose(
+        "train", [f"preset={preset}", "output_dir=unused", f"model.attention={device.attention}", *settings]
+    )
+    model, size = build_model(cfg, pretrained=False).eval(), tuple(cfg.views.image_size)
+    cameras = cameras.scaled_to(size)
+    views = len(cameras.intrinsics)
+    forecast = prediction_bytes(model, load_of(model, cameras, 1, device), views_at_once=views_at_once)
     images = torch.randint(0, 256, (1, views, 3, *size), dtype=torch.uint8)
     lead = (cameras.intrinsics[None].float(), cameras.world_from_camera[None].float())
-    model.to(device)
-    seen = Views(images, *lead).to(device)
-    weights = sum(4 * parameter.numel() for parameter in model.parameters()) + images.numel()
-    began = time.perf_counter()
-    peak = peak_mebibytes(lambda: model.predict(seen, views_at_once=views_at_once)) + weights / 2**20
+    if device.torch.type == "cpu":
+        held = device.held()  # the dry run of the forecast is over; the network and the images are added
+        held -= sum(tensor.nbytes for tensor in (*model.parameters(), images))
+    model.to(device.torch)
+    seen = Views(images, *lead).to(device.torch)
+    model.predict(seen, views_at_once=views_at_once)
+    peak = device.peak() - held
+    began = device.clock()
+    model.predict(seen, views_at_once=views_at_once)
+    x, y, z = model.grid_resolution
     return {
-        "preset": arguments.preset,
+        "preset": preset,
         "views": views,
-        "voxels": grid.num_voxels,
+        "voxels": x * y * z,
         "views_at_once": views_at_once or "all",
-        "peak_mib": peak,
-        "forecast_mib": (SCRATCH * forecast + FIXED) / 2**20,
-        "seconds": time.perf_counter() - began,
+        "peak_mib": peak / MEBIBYTE,
+        "forecast_mib": (SCRATCH * forecast + FIXED) / MEBIBYTE,
+        "seconds": device.clock() - began,
     }
 
 
@@ -69,28 +82,37 @@ def main() -> None:
     arguments = parser.parse_args()
     if arguments.only:
         views, at_once = json.loads(arguments.only)
-        print(json.dumps(measure(arguments, views, at_once)))
+        cameras = cameras_of(arguments, views)
+        try:
+            row = predict_once(arguments.preset, arguments.settings, cameras, at_once, this_device())
+        except Exception as error:  # whatever it is, it ends this size alone
+            row = {"preset": arguments.preset, "views": views, "views_at_once": at_once or "all"}
+            row |= {"error": reason(error)}
+        print(json.dumps(row))
         return
     print_machine()
     rows = []
     for views in arguments.views:
         for at_once in arguments.views_at_once:
             case = json.dumps([views, None if at_once == "all" else int(at_once)])
-            done = subprocess.run(
-                [sys.executable, str(Path(__file__)), *sys.argv[1:], f"--only={case}"],
-                stdout=subprocess.PIPE,
-                text=True,
-                check=True,
-            )
-            row = json.loads(done.stdout.splitlines()[-1])
+            command = [sys.executable, str(Path(__file__)), *sys.argv[1:], f"--only={case}"]
+            done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
+            if done.returncode:
+                row = {"preset": arguments.preset, "views": views, "views_at_once": at_once}
+                row |= {"error": f"the process ended with code {done.returncode}"}
+            else:
+                row = json.loads(done.stdout.splitlines()[-1])
             rows.append(row)
-            print(
-                f"{views:4d} views, {at_once:>4s} at once: {row['peak_mib']:7.0f} MiB "
-                f"(forecast {row['forecast_mib']:.0f}), {row['seconds']:.1f} s"
-            )
+            print(f"{views:4d} views, {at_once:>4s} at once: {_in_words(row)}")
     if arguments.output:
         most = max(arguments.views)
         write_rows(arguments.output / f"prediction-{arguments.preset}-{most}.csv", rows)
+
+
+def _in_words(row: dict[str, object]) -> str:
+    if "error" in row:
+        return f"does not run here: {row['error']}"
+    return f"{row['peak_mib']:7.0f} MiB (forecast {row['forecast_mib']:.0f}), {row['seconds']:.1f} s"
 
 
 if __name__ == "__main__":

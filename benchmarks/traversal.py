@@ -6,14 +6,22 @@ from __future__ import annotations
 import argparse
 from functools import partial
 
-import torch
 from camera_path import FEATURE_SIZE, add_arguments, cameras_of, paper_grid
+from device import Device, this_device
 from record import write_rows
-from timing import median_seconds, peak_mebibytes, print_machine
+from timing import MEBIBYTE, Run, measure, print_machine
 
+from raytran.geometry.camera import Cameras
 from raytran.ops.fused import listed
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_tracer import RayTracer
+
+
+def tracers(cameras: Cameras, device: Device, feature_size: tuple[int, int] = FEATURE_SIZE) -> dict[str, Run]:
+    """Return tracing with one and with four rays a cell, both orders made."""
+    grid = paper_grid(cameras)
+    trace = RayTracer(device.attention)
+    return {f"{n}×{n} rays a cell": partial(trace, cameras, grid, feature_size, n) for n in (1, 2)}
 
 
 def main() -> None:
@@ -22,34 +30,42 @@ def main() -> None:
     add_arguments(parser, rounds=15)
     parser.add_argument("--views", type=int, nargs="+", default=[20])
     arguments = parser.parse_args()
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = this_device()
     print_machine()
     rows = []
     for views in arguments.views:
-        cameras = cameras_of(arguments, views, device)
-        grid = paper_grid(cameras)
-        tracers = {
-            f"{n}×{n} rays a cell": partial(RayTracer(), cameras, grid, FEATURE_SIZE, n) for n in (1, 2)
-        }
-        pairs = {name: listed(trace()) for name, trace in tracers.items()}
-        found = pairs["2×2 rays a cell"]
+        candidates = tracers(cameras_of(arguments, views, device.torch), device)
+        counts: dict[str, int] = {}
 
-        def sort_by_voxel(found: PairList = found) -> object:
-            return PairList(found.pixel_index, found.voxel_index, found.num_pixels, found.num_voxels).by(
-                "voxels"
+        def count(name: str, trace: Run, counts: dict[str, int] = counts) -> object:
+            pairs = trace()
+            counts[name] = counts.get(name) or len(listed(pairs))
+            return pairs
+
+        runs: dict[str, Run] = {name: partial(count, name, trace) for name, trace in candidates.items()}
+        if device.torch.type == "cpu":
+            found = listed(candidates["2×2 rays a cell"]())
+            runs["sorting 2×2 by voxel"] = partial(sort_by_voxel, found)
+            counts["sorting 2×2 by voxel"] = len(found)
+        for name, taken in measure(runs, arguments.rounds, device).items():
+            row = {"views": views, "what": name, "pairs": counts.get(name), "seconds": taken.seconds}
+            if taken.error:
+                rows.append(row | {"error": taken.error})
+                print(f"{views:4d} views  {name:24s} does not run here: {taken.error}")
+                continue
+            rows.append(row | {"peak_mib": taken.peak / MEBIBYTE})
+            print(
+                f"{views:4d} views  {name:24s} {counts[name]:11,} pairs {taken.seconds * 1e3:8.2f} ms"
+                f"  {taken.peak / MEBIBYTE:6.0f} MiB"
             )
-
-        candidates = (
-            dict(tracers) if device.type == "cuda" else {**tracers, "sorting 2×2 by voxel": sort_by_voxel}
-        )
-        peaks = {name: peak_mebibytes(run) for name, run in candidates.items()}
-        seconds = median_seconds(candidates, arguments.rounds)
-        for name, taken in seconds.items():
-            count, peak = len(pairs.get(name, found)), peaks[name]
-            rows.append({"views": views, "what": name, "pairs": count, "seconds": taken, "peak_mib": peak})
-            print(f"{views:4d} views  {name:24s} {count:11,} pairs {taken * 1e3:8.2f} ms  {peak:6.0f} MiB")
     if arguments.output:
         write_rows(arguments.output / "traversal.csv", rows)
+
+
+def sort_by_voxel(pairs: PairList) -> object:
+    """Bring a list, which has no order yet, into that of the voxels."""
+    fresh = PairList(pairs.pixel_index, pairs.voxel_index, pairs.num_pixels, pairs.num_voxels)
+    return fresh.by("voxels")
 
 
 if __name__ == "__main__":

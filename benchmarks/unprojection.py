@@ -13,8 +13,9 @@ from functools import partial
 import torch
 import torch.nn.functional as F
 from camera_path import FEATURE_SIZE, add_arguments, cameras_of, paper_grid
+from device import this_device
 from record import write_rows
-from timing import median_seconds, peak_mebibytes, print_machine
+from timing import MEBIBYTE, measure, print_machine
 from torch import Tensor
 
 from raytran.geometry.camera import Cameras
@@ -47,25 +48,30 @@ def main() -> None:
     add_arguments(parser, rounds=5)
     parser.add_argument("--views", type=int, nargs="+", default=[20])
     arguments = parser.parse_args()
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    device = this_device()
     print_machine()
     rows = []
     for views in arguments.views:
-        cameras = cameras_of(arguments, views, device)
+        cameras = cameras_of(arguments, views, device.torch)
         grid = paper_grid(cameras)
         pairs = RayTracer()(cameras, grid, FEATURE_SIZE, 2)
-        features = torch.randn(views, *FEATURE_SIZE, CHANNELS, device=device)
+        features = torch.randn(views, *FEATURE_SIZE, CHANNELS, device=device.torch)
         source = features.view(-1, HEADS, CHANNELS // HEADS)
-        query = torch.randn(grid.num_voxels, *source.shape[1:], device=device)
+        query = torch.randn(grid.num_voxels, *source.shape[1:], device=device.torch)
         candidates = {
             "mean unprojection (ImVoxelNet)": partial(unproject, features, cameras, grid),
             "splatting along rays": partial(splat_features, features.flatten(0, 2), pairs),
             "ray-traced attention": partial(ray_attention, query, source, source, pairs),
         }
-        peaks = {name: peak_mebibytes(run) for name, run in candidates.items()}
-        for name, taken in median_seconds(candidates, arguments.rounds).items():
-            rows.append({"views": views, "what": name, "seconds": taken, "peak_mib": peaks[name]})
-            print(f"{views:4d} views  {name:32s} {taken * 1e3:9.2f} ms  {peaks[name]:7.0f} MiB")
+        for name, taken in measure(candidates, arguments.rounds, device).items():
+            row = {"views": views, "what": name, "seconds": taken.seconds}
+            if taken.error:
+                rows.append(row | {"error": taken.error})
+                print(f"{views:4d} views  {name:32s} does not run here: {taken.error}")
+                continue
+            rows.append(row | {"peak_mib": taken.peak / MEBIBYTE})
+            milliseconds, mebibytes = 1e3 * taken.seconds, taken.peak / MEBIBYTE
+            print(f"{views:4d} views  {name:32s} {milliseconds:9.2f} ms  {mebibytes:7.0f} MiB")
     if arguments.output:
         write_rows(arguments.output / "unprojection.csv", rows)
 
