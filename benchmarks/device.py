@@ -16,13 +16,16 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import lightning.pytorch as pl
 import torch
 
 import raytran
-from raytran.ops.fused import Attention
+
+if TYPE_CHECKING:
+    import lightning.pytorch as pl
+
+    from raytran.ops.fused import Attention
 
 Run = Callable[[], object]
 
@@ -31,19 +34,25 @@ class Device:
     """The processor, and what a device is asked for.
 
     Attributes:
-        torch: where tensors go.
+        torch_device: where tensors go.
         attention: ``model.attention`` by which networks run their kernels there.
         trainer: settings of ``conf/train.yaml`` that make the Trainer use it.
+        command: the same for a command that is started.
         why_unmeasured: why times and memory of a GPU cannot be taken here, in words; "" where they can.
     """
 
-    torch = torch.device("cpu")
+    torch_device = torch.device("cpu")
     attention: Attention = "auto"
     trainer: tuple[str, ...] = ("trainer=cpu",)
+    command: tuple[str, ...] = ("trainer=cpu",)
     why_unmeasured = "this is no GPU"
 
     def running(self) -> AbstractContextManager[object]:
         """Return the context in which everything on the device happens."""
+        return nullcontext()
+
+    def counting(self) -> AbstractContextManager[object]:
+        """Return the context of training steps that are only counted or timed, not judged by their values."""
         return nullcontext()
 
     def adopt(self, trainer: pl.Trainer) -> None:
@@ -93,28 +102,28 @@ class Device:
 class Gpu(Device):
     """An NVIDIA GPU."""
 
-    trainer = ("trainer=gpu",)
+    trainer = command = ("trainer=gpu",)
     why_unmeasured = ""
 
     def __init__(self, index: int = 0) -> None:
-        self.torch = torch.device("cuda", index)
+        self.torch_device = torch.device("cuda", index)
         self._cycles_per_second = 0.0
         self._cache: torch.Tensor | None = None
 
     def wait(self) -> None:
         """Wait until the GPU has done all that it was given."""
-        torch.cuda.synchronize(self.torch)
+        torch.cuda.synchronize(self.torch_device)
 
     def held(self) -> int:
         """Return the bytes of all tensors, and let ``peak`` count from now on."""
         gc.collect()
         self.wait()
-        torch.cuda.reset_peak_memory_stats(self.torch)
-        return torch.cuda.memory_allocated(self.torch)
+        torch.cuda.reset_peak_memory_stats(self.torch_device)
+        return torch.cuda.memory_allocated(self.torch_device)
 
     def peak(self) -> int:
         """Return the most bytes of tensors since ``held``."""
-        return torch.cuda.max_memory_allocated(self.torch)
+        return torch.cuda.max_memory_allocated(self.torch_device)
 
     def alone_seconds(self, candidates: Mapping[str, Run], rounds: int) -> dict[str, float]:
         """Return the median time of each on the GPU alone.
@@ -124,7 +133,7 @@ class Gpu(Device):
         """
         self._cycles_per_second = self._cycles_per_second or self._measured_cycles()
         if self._cache is None:
-            self._cache = torch.empty(1 << 28, dtype=torch.int8, device=self.torch)
+            self._cache = torch.empty(1 << 28, dtype=torch.int8, device=self.torch_device)
         ahead = {name: 2 * self._called_seconds(run) + 1e-3 for name, run in candidates.items()}
         taken: dict[str, list[float]] = {name: [] for name in candidates}
         for _ in range(rounds):

@@ -102,10 +102,11 @@ def run_steps(
         device.adopt(trainer)
         watch = _Watch(device, warm_up, timed, clock)
         trainer.callbacks.append(watch)
-        if device.torch.type != "cpu":
+        if device.torch_device.type != "cpu":
             batch = batch.pin_memory()  # as the loader of a run does
         scenes: list[Any] = [batch] * cfg.trainer.max_steps
-        trainer.fit(module, DataLoader(scenes, batch_size=None))
+        with device.counting():
+            trainer.fit(module, DataLoader(scenes, batch_size=None))
     return Steps(
         seconds=statistics.median(watch.seconds) if watch.seconds else math.nan,
         peak=device.peak() - held,

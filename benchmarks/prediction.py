@@ -21,6 +21,7 @@ from step import load_of
 from timing import MEBIBYTE, print_machine, reason
 
 from raytran.geometry.camera import Cameras
+from raytran.ops.ray_tracer import RayTracer
 from raytran.run.build import build_model
 from raytran.run.entry import compose
 from raytran.run.forecast import prediction_bytes
@@ -40,20 +41,18 @@ def predict_once(
     The peak has weights and images in it. The time is that of a second prediction.
     """
     held = device.held()
-    cfg = compose(
-        "train", [f"preset={preset}", "output_dir=unused", f"model.attention={device.attention}", *settings]
-    )
+    cfg = compose("train", [f"preset={preset}", "output_dir=unused", *settings])
     model, size = build_model(cfg, pretrained=False).eval(), tuple(cfg.views.image_size)
     cameras = cameras.scaled_to(size)
     views = len(cameras.intrinsics)
     forecast = prediction_bytes(model, load_of(model, cameras, 1, device), views_at_once=views_at_once)
     images = torch.randint(0, 256, (1, views, 3, *size), dtype=torch.uint8)
     lead = (cameras.intrinsics[None].float(), cameras.world_from_camera[None].float())
-    if device.torch.type == "cpu":
+    if device.torch_device.type == "cpu":
         held = device.held()  # the dry run of the forecast is over; the network and the images are added
         held -= sum(tensor.nbytes for tensor in (*model.parameters(), images))
-    model.to(device.torch)
-    seen = Views(images, *lead).to(device.torch)
+    model.to(device.torch_device).ray_tracer = RayTracer(device.attention)
+    seen = Views(images, *lead).to(device.torch_device)
     model.predict(seen, views_at_once=views_at_once)
     peak = device.peak() - held
     began = device.clock()

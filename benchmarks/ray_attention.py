@@ -14,7 +14,7 @@ A candidate that fails, or finds something else than ours, is named in its row a
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -102,10 +102,10 @@ class Case:
         (self.source, self.target), (self.sources, self.targets) = indices[way], counts[way]
         numbers = torch.Generator().manual_seed(0)
         self.tensors = [
-            torch.randn(n, heads, CHANNELS, generator=numbers).to(device.torch, dtype)
+            torch.randn(n, heads, CHANNELS, generator=numbers).to(device.torch_device, dtype)
             for n in (self.targets, self.sources, self.sources)
         ]
-        self.gradient = torch.randn(self.tensors[0].shape, generator=numbers).to(device.torch, dtype)
+        self.gradient = torch.randn(self.tensors[0].shape, generator=numbers).to(device.torch_device, dtype)
 
     def ours(self) -> Attention:
         """Return the operator."""
@@ -182,13 +182,18 @@ class Case:
 
 
 def measure_case(
-    case: Case, names: list[str], share: float, rounds: int, bytes_per_second: float
+    case: Case,
+    names: list[str],
+    share: float,
+    rounds: int,
+    bytes_per_second: float,
+    jobs: Sequence[str] = JOBS,
 ) -> list[dict[str, Any]]:
     """Return the medians of one case, forward and with the backward pass, a row for each candidate."""
     baselines = case.baselines(names, share)
     attends = {"ray_attention": (case.ours(), 1.0)} | baselines
     rows = []
-    for job in JOBS:
+    for job in jobs:
         runs = {}
         for name, found in attends.items():
             if isinstance(found, str) or (name == BASELINES["dense"] and job != JOBS[0]):
@@ -269,10 +274,10 @@ def main() -> None:
     arguments = parser.parse_args()
     device = this_device()
     print_machine()
-    bandwidth = measure_ceilings(device.torch).bytes_per_second
+    bandwidth = measure_ceilings(device.torch_device).bytes_per_second
     rows = []
     for views in arguments.views:
-        cameras = cameras_of(arguments, views, device.torch)
+        cameras = cameras_of(arguments, views, device.torch_device)
         for resolution in arguments.resolution:
             x, y, z = (int(n) for n in resolution.split("x"))
             for dtype in arguments.dtype:

@@ -36,6 +36,7 @@ from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.model import RayTran
 from raytran.ops.fused import listed
+from raytran.ops.ray_tracer import RayTracer
 from raytran.ops.traverse import trace_pairs
 from raytran.run.build import build_model, choose_precision
 from raytran.run.ceilings import Ceilings, measure_ceilings
@@ -121,6 +122,7 @@ def _step_columns(steps: Steps) -> dict[str, Any]:
 def forecast_bytes(cfg: DictConfig, cameras: Cameras, device: Device, precision: str) -> int:
     """Return ``raytran.plan``'s forecast of the peak, without what a process has that has done nothing."""
     model = build_model(cfg, pretrained=False)
+    model.ray_tracer = RayTracer()  # the dry run is one on the CPU
     load = load_of(model, cameras, cfg.views.batch_size, device)
     stage: Stage = instantiate(cfg.stage, _convert_="all")
     return round(SCRATCH * training_bytes(model, load, stage, precision=precision)) + FIXED
@@ -133,7 +135,7 @@ def load_of(model: RayTran, cameras: Cameras, scenes: int, device: Device) -> Lo
     tracer = model.backbone.tracer or trace_pairs
     pairs = tracer(cameras, grid, (height // stride, width // stride), model.rays_per_cell)
     per_pixel = len(pairs) / pairs.num_pixels
-    fused = device.torch.type != "cpu"
+    fused = device.torch_device.type != "cpu"
     return Load(scenes, len(cameras.intrinsics), (height, width), per_pixel, fused=fused)
 
 
@@ -152,16 +154,16 @@ def measure_parts(
     cfg: DictConfig, cameras: Cameras, device: Device, arguments: argparse.Namespace, clock: Clock
 ) -> list[dict[str, Any]]:
     """Return and print what each part must cost, and unless ``--count`` what it takes."""
-    precision = choose_precision(str(cfg.precision), on_cpu=device.torch.type == "cpu")
+    precision = choose_precision(str(cfg.precision), on_cpu=device.torch_device.type == "cpu")
     if arguments.ceilings:
         ceilings = Ceilings(1e12 * arguments.ceilings[0], 1e9 * arguments.ceilings[1])
         precision = "bf16-mixed"
     else:
-        ceilings = measure_ceilings(device.torch, _DTYPES[precision], clock or time.perf_counter)
-    model = build_model(cfg, pretrained=False).to(device.torch).train()
+        ceilings = measure_ceilings(device.torch_device, _DTYPES[precision], clock or time.perf_counter)
+    model = build_model(cfg, pretrained=False).to(device.torch_device).train()
     stage: Stage = instantiate(cfg.stage, _convert_="all")
     stage.freeze(model)
-    views = random_batch(cameras, model, cfg.views.batch_size).views.to(device.torch)
+    views = random_batch(cameras, model, cfg.views.batch_size).views.to(device.torch_device)
     rows, parts = count_parts(model, views, stage, ceilings, precision, device)
     if not arguments.count:
         runs = {part.name: partial(train_part, part, _DTYPES[precision], device) for part in parts}
@@ -189,7 +191,7 @@ def count_parts(
     count = len(listed(pairs))
     tera, giga = ceilings.operations_per_second / 1e12, ceilings.bytes_per_second / 1e9
     print(f"ceilings: {tera:.3g} TFLOP/s, {giga:.4g} GB/s; {count:,} pairs; {precision}")
-    fused = device.torch.type != "cpu"
+    fused = device.torch_device.type != "cpu"
     load = Load(*views.images.shape[:2], views.image_size, count / pairs.num_pixels, fused)
     work = work_of_parts(model, load, training=True, precision=precision, stage=stage)
     parts = step_parts(model, views, pairs, tasks=stage.tasks)
@@ -234,7 +236,7 @@ def train_part(part: Part, dtype: torch.dtype, device: Device) -> None:
 
 
 def _autocast(dtype: torch.dtype, device: Device) -> AbstractContextManager[None]:
-    return torch.autocast(device.torch.type, dtype=dtype, enabled=dtype != torch.float32)
+    return torch.autocast(device.torch_device.type, dtype=dtype, enabled=dtype != torch.float32)
 
 
 if __name__ == "__main__":

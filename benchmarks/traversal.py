@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 from functools import partial
 
-from camera_path import FEATURE_SIZE, add_arguments, cameras_of, paper_grid
+from camera_path import FEATURE_SIZE, PAPER_GRID, add_arguments, cameras_of, paper_grid
 from device import Device, this_device
 from record import write_rows
 from timing import MEBIBYTE, Run, measure, print_machine
@@ -17,9 +17,14 @@ from raytran.ops.pairs import PairList
 from raytran.ops.ray_tracer import RayTracer
 
 
-def tracers(cameras: Cameras, device: Device, feature_size: tuple[int, int] = FEATURE_SIZE) -> dict[str, Run]:
+def tracers(
+    cameras: Cameras,
+    device: Device,
+    feature_size: tuple[int, int] = FEATURE_SIZE,
+    resolution: tuple[int, int, int] = PAPER_GRID,
+) -> dict[str, Run]:
     """Return tracing with one and with four rays a cell, both orders made."""
-    grid = paper_grid(cameras)
+    grid = paper_grid(cameras, resolution)
     trace = RayTracer(device.attention)
     return {f"{n}×{n} rays a cell": partial(trace, cameras, grid, feature_size, n) for n in (1, 2)}
 
@@ -34,7 +39,7 @@ def main() -> None:
     print_machine()
     rows = []
     for views in arguments.views:
-        candidates = tracers(cameras_of(arguments, views, device.torch), device)
+        candidates = tracers(cameras_of(arguments, views, device.torch_device), device)
         counts: dict[str, int] = {}
 
         def count(name: str, trace: Run, counts: dict[str, int] = counts) -> object:
@@ -43,7 +48,7 @@ def main() -> None:
             return pairs
 
         runs: dict[str, Run] = {name: partial(count, name, trace) for name, trace in candidates.items()}
-        if device.torch.type == "cpu":
+        if device.torch_device.type == "cpu":
             found = listed(candidates["2×2 rays a cell"]())
             runs["sorting 2×2 by voxel"] = partial(sort_by_voxel, found)
             counts["sorting 2×2 by voxel"] = len(found)

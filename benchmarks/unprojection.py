@@ -52,12 +52,12 @@ def main() -> None:
     print_machine()
     rows = []
     for views in arguments.views:
-        cameras = cameras_of(arguments, views, device.torch)
+        cameras = cameras_of(arguments, views, device.torch_device)
         grid = paper_grid(cameras)
         pairs = RayTracer()(cameras, grid, FEATURE_SIZE, 2)
-        features = torch.randn(views, *FEATURE_SIZE, CHANNELS, device=device.torch)
+        features = torch.randn(views, *FEATURE_SIZE, CHANNELS, device=device.torch_device)
         source = features.view(-1, HEADS, CHANNELS // HEADS)
-        query = torch.randn(grid.num_voxels, *source.shape[1:], device=device.torch)
+        query = torch.randn(grid.num_voxels, *source.shape[1:], device=device.torch_device)
         candidates = {
             "mean unprojection (ImVoxelNet)": partial(unproject, features, cameras, grid),
             "splatting along rays": partial(splat_features, features.flatten(0, 2), pairs),
