@@ -51,18 +51,21 @@ def select_objects(
 
 
 def _first_of_duplicates(objects: ObjectSet, duplicate_iou: float) -> Tensor:
-    """Return where an object is no duplicate of an earlier one that is kept, ``(M,)`` bool."""
+    """Return which objects are no duplicates of an earlier one that is kept, ``(K,)`` int64."""
     boxes = OrientedBoxes(objects.center, objects.size, objects.rotation)
     duplicates = (box_iou(boxes, boxes)[0] > duplicate_iou) & (objects.label[:, None] == objects.label)
     return _first_of(duplicates)
 
 
 def _first_of(duplicates: Tensor) -> Tensor:
-    """Return where none that is kept comes earlier and is a duplicate, ``(M,)`` bool, of ``(M, M)`` bool."""
-    keep = torch.ones(len(duplicates), dtype=torch.bool)
-    for index in range(len(duplicates)):
-        keep[index] = not bool((duplicates[index, :index] & keep[:index]).any())
-    return keep
+    """Return which have no duplicate among those kept before them: ``(M, M)`` bool → ``(K,)`` int64."""
+    # Each depends on those before: gone through on the host, so that a GPU is waited for once.
+    of_earlier = duplicates.cpu().numpy()
+    kept: list[int] = []
+    for index, row in enumerate(of_earlier):
+        if not row[kept].any():
+            kept.append(index)
+    return torch.tensor(kept, dtype=torch.int64, device=duplicates.device)
 
 
 def count_object_views(prediction: ScenePrediction, *, grid_extent: tuple[float, float, float]) -> ObjectSet:
@@ -75,15 +78,15 @@ def count_object_views(prediction: ScenePrediction, *, grid_extent: tuple[float,
     objects, seen = prediction.objects, prediction.seen
     if seen is None:
         return objects
-    side = (torch.arange(_POINTS_PER_SIDE) + 0.5) / _POINTS_PER_SIDE - 0.5
-    local = torch.cartesian_prod(side, side, side).to(objects.size) * objects.size[:, None]
+    side = (torch.arange(_POINTS_PER_SIDE, device=objects.size.device) + 0.5) / _POINTS_PER_SIDE - 0.5
+    local = torch.cartesian_prod(side, side, side).to(objects.size.dtype) * objects.size[:, None]
     points = local @ objects.rotation.transpose(1, 2) + objects.center[:, None]
     x, y, z = seen.shape
     grid = VoxelGrid((x, y, z), grid_extent, prediction.grid_center.to(points))
     voxel = grid.voxel_from_world(points.flatten(0, 1)).floor().long()
-    inside = ((voxel >= 0) & (voxel < torch.tensor(seen.shape))).all(dim=1)
-    counts = torch.zeros(len(voxel))
-    counts[inside] = seen.flatten()[grid.flat_index(voxel[inside])].float()
+    axes = zip(voxel.unbind(dim=1), seen.shape, strict=True)
+    inside = torch.stack([(index >= 0) & (index < count) for index, count in axes]).all(dim=0)
+    counts = seen.flatten()[grid.flat_index(voxel).where(inside, 0)].float().where(inside, 0.0)
     return replace(objects, num_views=counts.view(len(objects), _POINTS_PER_SIDE**3).mean(dim=1))
 
 
@@ -95,7 +98,7 @@ def merge_volumes(predictions: Sequence[ScenePrediction], volumes: Volumes) -> S
     between two.
 
     Args:
-        predictions: one for each of the T volumes, on the CPU.
+        predictions: one for each of the T volumes, all on one device.
         volumes: where they are.
 
     Returns:
@@ -103,8 +106,11 @@ def merge_volumes(predictions: Sequence[ScenePrediction], volumes: Volumes) -> S
         ``foreground``, which is of other frames in each volume.
     """
     parts = [prediction.objects for prediction in predictions]
-    volume = torch.cat([torch.full((len(part),), index) for index, part in enumerate(parts)])
+    volume = torch.cat(
+        [torch.full((len(part),), index, device=part.label.device) for index, part in enumerate(parts)]
+    )
     objects = _join(parts)
+    volumes = replace(volumes, center=volumes.center.to(objects.center.device))
     owned = volumes.owner(objects.center) == volume
     to_middle = volumes.center[volume] - objects.center
     moved = objects.center + to_middle.clamp(-_NEARLY_OWN, _NEARLY_OWN)
@@ -146,11 +152,12 @@ def _join_voxels(values: Sequence[Tensor | None], volumes: Volumes) -> Tensor | 
     present = [value for value in values if value is not None]
     if len(present) < len(volumes):
         return None
-    joint, one = volumes.joint(), VoxelGrid(volumes.resolution, volumes.extent, torch.zeros(3))
-    size = torch.tensor(volumes.extent)
+    joint, device = volumes.joint(), present[0].device
+    one = VoxelGrid(volumes.resolution, volumes.extent, torch.zeros(3, device=device))
+    size = torch.tensor(volumes.extent, device=device)
     from_middle = (one.voxel_centers() / size).square().sum(dim=-1)
     result = present[0].new_zeros(joint.resolution)
-    nearest = torch.full(joint.resolution, torch.inf)
+    nearest = torch.full(joint.resolution, torch.inf, device=device)
     for value, corner in zip(present, volumes.corner_index().tolist(), strict=True):
         place = tuple(
             slice(start, start + count) for start, count in zip(corner, volumes.resolution, strict=True)

@@ -39,7 +39,7 @@ def fit(module, batch, steps=2, callbacks=()):
         enable_model_summary=False,
         callbacks=[StageSetup(), *callbacks],
     )
-    loader = torch.utils.data.DataLoader([batch], batch_size=None)
+    loader = torch.utils.data.DataLoader([batch] * steps, batch_size=None)
     trainer.fit(module, loader, loader)
     return trainer
 

@@ -91,7 +91,7 @@ class Cameras:
         v, u = torch.broadcast_tensors(v, u)
         image = torch.stack([u, v, torch.ones_like(u)], dim=-1).reshape(-1, 3)
         # On a GPU an error check would make the host wait.
-        inverse, _ = torch.linalg.inv_ex(scaled.intrinsics, check_errors=not scaled.intrinsics.is_cuda)
+        inverse, _ = torch.linalg.inv_ex(scaled.intrinsics, check_errors=scaled.intrinsics.is_cpu)
         world_from_image = self.world_from_camera[..., :3, :3] @ inverse
         rays = torch.einsum("...ij,kj->...ki", world_from_image, image)
         directions = rays.unflatten(-2, (height, width, n * n))

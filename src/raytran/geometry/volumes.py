@@ -69,7 +69,8 @@ class Volumes:
 
     def joint(self) -> VoxelGrid:
         """Return the grid of the same voxels that just holds all volumes."""
-        x, y, z = (self.corner_index().amax(dim=0) + torch.tensor(self.resolution)).tolist()
+        last = self.corner_index().amax(dim=0).tolist()
+        x, y, z = (start + count for start, count in zip(last, self.resolution, strict=True))
         voxel = [length / count for length, count in zip(self.extent, self.resolution, strict=True)]
         extent = (x * voxel[0], y * voxel[1], z * voxel[2])
         return VoxelGrid((x, y, z), extent, (self.center.amin(dim=0) + self.center.amax(dim=0)) / 2)

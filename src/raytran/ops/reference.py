@@ -57,14 +57,15 @@ def trace_pairs(
     precise = Cameras(cameras.intrinsics.double(), cameras.world_from_camera.double(), cameras.image_size)
     directions = precise.cell_rays(feature_size, rays_per_cell)[1].flatten(0, 2)
     pixels_of_view = feature_size[0] * feature_size[1]
-    center, size = grid.center.double(), torch.tensor(grid.extent).double() / torch.tensor(grid.resolution)
-    corner = center - torch.tensor(grid.extent).double() / 2
-    index = torch.cartesian_prod(*(torch.arange(n) for n in grid.resolution)).reshape(-1, 3)
+    device = directions.device
+    precise_grid = VoxelGrid(grid.resolution, grid.extent, grid.center.double().to(device))
+    corner, size = precise_grid.lower, precise_grid.voxel_size
+    index = torch.cartesian_prod(*(torch.arange(n, device=device) for n in grid.resolution)).reshape(-1, 3)
     lower, upper = corner + index * size, corner + (index + 1) * size
     pixels, voxels = [], []
     for pixel, rays in enumerate(directions):
         origin = precise.position[pixel // pixels_of_view]
-        crossed = torch.zeros(len(index), dtype=torch.bool)
+        crossed = torch.zeros(len(index), dtype=torch.bool, device=device)
         for ray in rays:
             crossed |= _depth_inside(origin, ray, lower, upper) > min_depth
         found = crossed.nonzero()[:, 0]
@@ -75,7 +76,8 @@ def trace_pairs(
 
 def _depth_inside(origin: Tensor, ray: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
     """Return over how much depth a ray is inside each of some boxes, ``(boxes,)``; negative if it misses."""
-    near, far = torch.zeros(len(lower)).double(), torch.full((len(lower),), torch.inf).double()
+    near = lower.new_zeros(len(lower))
+    far = torch.full_like(near, torch.inf)
     for axis in range(3):
         low, high = lower[:, axis], upper[:, axis]
         if ray[axis].abs() < 1e-12:

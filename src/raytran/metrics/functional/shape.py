@@ -52,6 +52,6 @@ def chamfer_distance(a: Tensor, b: Tensor) -> float:
     """
     if not len(a) or not len(b):
         return float("nan")
-    first, second = a.numpy(), b.numpy()
+    first, second = a.cpu().numpy(), b.cpu().numpy()
     to_second, to_first = cKDTree(second).query(first)[0], cKDTree(first).query(second)[0]
     return float(to_second.mean() + to_first.mean()) / 2
