@@ -52,7 +52,7 @@ class Device:
         return nullcontext()
 
     def counting(self) -> AbstractContextManager[object]:
-        """Return the context of training steps that are only counted or timed, not judged by their values."""
+        """Return the context of what is only counted or timed, and not judged by its values."""
         return nullcontext()
 
     def adopt(self, trainer: pl.Trainer) -> None:

@@ -13,7 +13,7 @@ import statistics
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
@@ -24,6 +24,7 @@ from device import Device
 from omegaconf import DictConfig
 from torch.utils.data import DataLoader
 
+from raytran.data.dataset import TARGETS
 from raytran.geometry.camera import Cameras
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.model import RayTran
@@ -94,9 +95,7 @@ def run_steps(
         cfg = cfg.copy()
         cfg.output_dir, cfg.trainer.max_steps = folder, warm_up + timed + 2
         module = build_module(cfg, build_model(cfg, pretrained=False))
-        batch = random_batch(
-            cameras, module.model, cfg.views.batch_size, shapes="shapes" in module.stage.targets
-        )
+        batch = random_batch(cameras, module.model, cfg.views.batch_size, module.stage.targets)
         card = {"stage": module.stage.name, "preset": cfg.preset, "config": plain(cfg)}
         trainer = build_trainer(cfg, RunConfig.read(cfg), card)
         device.adopt(trainer)
@@ -158,8 +157,10 @@ class _Watch(pl.Callback):
         self._open.close()
 
 
-def random_batch(cameras: Cameras, model: RayTran, scenes: int, *, shapes: bool = False) -> SceneBatch:
-    """Return ``scenes`` equal scenes of random images, ten objects each, with shapes if asked for."""
+def random_batch(
+    cameras: Cameras, model: RayTran, scenes: int, targets: Collection[str] = TARGETS
+) -> SceneBatch:
+    """Return ``scenes`` equal scenes of random images with ten objects each, and the targets asked for."""
     views = len(cameras.intrinsics)
     lead, size = (scenes, views), cameras.image_size
     images = torch.randint(0, 256, (*lead, model.backbone.resnet.input_channels, *size), dtype=torch.uint8)
@@ -172,7 +173,7 @@ def random_batch(cameras: Cameras, model: RayTran, scenes: int, *, shapes: bool 
         rotation=rotation_from_yaw(6.3 * torch.rand(10)),
         symmetry=torch.ones(10, dtype=torch.int64),
         score=torch.ones(10),
-        shape=torch.rand(10, *[SHAPE_SIZE] * 3) > 0.5 if shapes else None,
+        shape=torch.rand(10, *[SHAPE_SIZE] * 3) > 0.5 if "shapes" in targets else None,
         model_id=("03001627/a",) * 10,
     )
     return SceneBatch(
@@ -180,9 +181,9 @@ def random_batch(cameras: Cameras, model: RayTran, scenes: int, *, shapes: bool 
         Views(images, *(pose.expand(scenes, *pose.shape) for pose in poses)),
         ((),) * scenes,
         center.expand(scenes, 3),
-        (objects,) * scenes,
-        torch.rand(scenes, *model.grid_resolution) > 0.95,
-        torch.rand(*lead, *size) > 0.7,
+        (objects,) * scenes if {"objects", "shapes"} & set(targets) else None,
+        torch.rand(scenes, *model.grid_resolution) > 0.95 if "occupancy" in targets else None,
+        torch.rand(*lead, *size) > 0.7 if "foreground" in targets else None,
     )
 
 

@@ -88,7 +88,7 @@ def main() -> None:
     parser.add_argument(
         "--parts", nargs="+", choices=tuple(PARTS), default=tuple(PARTS), help="all without it"
     )
-    # For the test of this file: on a device that is none, at small sizes, the steps of a part in one process.
+    # For the test of this file: on a device that is none, at small sizes, all steps in one process.
     parser.add_argument("--device", choices=("cuda", "pretend"), default="cuda", help=argparse.SUPPRESS)
     parser.add_argument("--steps", nargs="+", choices=tuple(STEPS), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -111,11 +111,8 @@ def run_parts(names: Sequence[str], folder: Path, device: str) -> list[Check]:
     chosen = [name for name, step in STEPS.items() if step.part in names]
     for name in chosen:
         _entries_of(folder, name).unlink(missing_ok=True)
-    groups = [[name] for name in chosen]
-    if device == "pretend":
-        # Seconds of imports are most of a step there.
-        training = [name for name in chosen if STEPS[name].part == "training"]
-        groups = [group for group in ([n for n in chosen if n not in training], training) if group]
+    # On the pretend device the seconds of imports would be most of a step.
+    groups = [chosen] if device == "pretend" else [[name] for name in chosen]
     parts = _report(folder, to_come=chosen)
     while groups:
         group = groups.pop(0)

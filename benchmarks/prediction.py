@@ -53,10 +53,11 @@ def predict_once(
         held -= sum(tensor.nbytes for tensor in (*model.parameters(), images))
     model.to(device.torch_device).ray_tracer = RayTracer(device.attention)
     seen = Views(images, *lead).to(device.torch_device)
-    model.predict(seen, views_at_once=views_at_once)
-    peak = device.peak() - held
-    began = device.clock()
-    model.predict(seen, views_at_once=views_at_once)
+    with device.counting():
+        model.predict(seen, views_at_once=views_at_once)
+        peak = device.peak() - held
+        began = device.clock()
+        model.predict(seen, views_at_once=views_at_once)
     x, y, z = model.grid_resolution
     return {
         "preset": preset,

@@ -221,10 +221,10 @@ class Pretend(torch.Tensor):
         return _run(func, args, kwargs or {})
 
 
-class _Everything(TorchDispatchMode):
+class Everything(TorchDispatchMode):
     """Sees also what starts on the CPU: tensors made on the device, page-locked memory, ranks that talk."""
 
-    def __enter__(self) -> _Everything:
+    def __enter__(self) -> Everything:
         # torch.tensor([...], device=...) is then made on the CPU and copied in a way that is seen.
         torch._C._set_only_lift_cpu_tensors(True)
         super().__enter__()
@@ -470,8 +470,8 @@ class _Backend(backend_registration._DummyBackendModule):
         torch.set_rng_state(state)
 
 
-def _set_up() -> None:
-    """Set up the backend in this process."""
+def set_up() -> None:
+    """Set up the backend in this process; what is done on it then stands in a block of ``Everything``."""
     torch.set_num_threads(1)
     torch.backends.mkldnn.set_flags(False)  # its 16-bit gradients of convolutions are noise on small volumes
     _set_up_backend(NAME, backend_module=_Backend())
@@ -559,7 +559,7 @@ def _serve() -> None:
     """Run tests as they come in, until the process ends that sends them."""
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)  # what a test prints must not come among the answers
-    _set_up()
+    set_up()
     while True:
         try:
             module, name, arguments = pickle.load(sys.stdin.buffer)
@@ -568,7 +568,7 @@ def _serve() -> None:
         failure = None
         try:
             test = getattr(importlib.import_module(module), name).__wrapped__
-            with _Everything(), recorded():
+            with Everything(), recorded():
                 test(**arguments)
         except BaseException:
             failure = traceback.format_exc()

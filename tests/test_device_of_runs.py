@@ -15,8 +15,6 @@ import lightning.pytorch as pl
 import pytest
 import torch
 import torch.distributed as dist
-from lightning.pytorch.accelerators import Accelerator, AcceleratorRegistry
-from lightning.pytorch.strategies import SingleDeviceStrategy, StrategyRegistry
 from torch import Tensor
 from torch.utils.data import DataLoader
 
@@ -46,6 +44,7 @@ from raytran.training.replay_file import read_replay
 from raytran.training.scores import SceneScores
 from raytran.types import SHAPE_SIZE, ObjectSet, SceneBatch, ScenePrediction, Views
 
+from .pretend_accelerator import register_with_lightning
 from .pretend_device import DEVICE, NAME, kernels_left_out, on_pretend_device, recorded
 
 pytest.importorskip("triton", reason="Triton is not installed: the fused kernels have nothing to run on")
@@ -107,36 +106,6 @@ BUDGET = {
 """What a training step of the paper's network may cost: measured; to be lowered when it costs less."""
 
 
-class PretendAccelerator(Accelerator):
-    """What Lightning wants to know of a device."""
-
-    def setup_device(self, device):
-        pass
-
-    def teardown(self):
-        pass
-
-    @staticmethod
-    def parse_devices(devices):
-        return devices
-
-    @staticmethod
-    def get_parallel_devices(devices):
-        return [torch.device(DEVICE)]
-
-    @staticmethod
-    def auto_device_count():
-        return 1
-
-    @staticmethod
-    def is_available():
-        return True
-
-    @staticmethod
-    def name():
-        return NAME
-
-
 class AllIsHere(pl.Callback):
     """Looks after the validation, before Lightning brings all back to the CPU."""
 
@@ -176,8 +145,7 @@ def module_of(cfg):
 
 def trainer_of(cfg, folder, *, steps, validate_every=None, callbacks=()):
     """Return the Trainer of a run of so many steps, and a validation at their end or oftener."""
-    AcceleratorRegistry.register(NAME, PretendAccelerator, override=True)
-    StrategyRegistry.register(NAME, SingleDeviceStrategy, override=True, device=torch.device(DEVICE))
+    register_with_lightning()
     cfg = cfg.copy()
     cfg.output_dir, cfg.precision, cfg.progress_bar = str(folder), "bf16-mixed", "none"
     cfg.trainer.update({"accelerator": NAME, "strategy": NAME, "max_steps": steps})

@@ -96,7 +96,7 @@ def _module_and_batch(
     module.stage.set_modes(module.model)
     height, width = cfg.views.image_size
     cameras = walk(views).scaled_to((height, width))
-    return module, random_batch(cameras, module.model, 1, shapes="shapes" in module.stage.targets)
+    return module, random_batch(cameras, module.model, 1, module.stage.targets)
 
 
 def losses_and_gradients(

@@ -4,22 +4,24 @@
 from __future__ import annotations
 
 import sys
+import types
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
+from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import lightning.pytorch as pl
 import torch
 from device import Device
-from lightning.pytorch.accelerators import Accelerator
-from lightning.pytorch.strategies import SingleDeviceStrategy
 
 from gpu_day.context import Sizes
 from raytran.ops import block_pairs
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "tests"))
-import pretend_device
+# Tests import each other from the package that pytest makes of their folder.
+sys.modules["tests"] = types.ModuleType("tests")
+sys.modules["tests"].__path__ = [str(Path(__file__).resolve().parents[2] / "tests")]
+pretend_device = import_module("tests.pretend_device")
+register_with_lightning = import_module("tests.pretend_accelerator").register_with_lightning
 
 SMALL = (
     "model.grid_resolution=[4,4,4]",
@@ -81,17 +83,22 @@ class PretendGpu(Device):
     """A device that is none: its kernels run in Triton's interpreter."""
 
     attention = "fused"
-    trainer = ("trainer.accelerator=auto", "+trainer.strategy={_target_:gpu_day.pretend.one_device}")
+    trainer = (
+        f"trainer.accelerator={pretend_device.NAME}",
+        f"trainer.strategy={pretend_device.NAME}",
+        "precision=bf16-mixed",
+    )
     why_unmeasured = "the pretend device has no clock and no memory of its own"
 
     def __init__(self) -> None:
-        pretend_device._set_up()
+        pretend_device.set_up()
+        register_with_lightning()
         block_pairs._SLOTS = 16  # the interpreter takes its time over every program, also of an unused slot
         self.torch_device = torch.device(pretend_device.DEVICE)
 
     def running(self) -> AbstractContextManager[object]:
         """Return the context in which everything on the device happens."""
-        return pretend_device._Everything()
+        return pretend_device.Everything()
 
     def counting(self) -> AbstractContextManager[object]:
         """Leave the kernels out: they count as before."""
@@ -116,43 +123,3 @@ class PretendGpu(Device):
         with pretend_device.recorded() as seen:
             yield count
         count.append(seen.launches.total())
-
-
-class _Accelerator(Accelerator):
-    """What Lightning asks of a kind of device."""
-
-    def setup_device(self, device: torch.device) -> None:
-        """Do nothing."""
-
-    def teardown(self) -> None:
-        """Do nothing."""
-
-    @staticmethod
-    def parse_devices(devices: Any) -> Any:
-        """Return what is given."""
-        return devices
-
-    @staticmethod
-    def get_parallel_devices(devices: Any) -> list[torch.device]:
-        """Return the one device."""
-        return [torch.device(pretend_device.DEVICE)]
-
-    @staticmethod
-    def auto_device_count() -> int:
-        """Return 1."""
-        return 1
-
-    @staticmethod
-    def is_available() -> bool:
-        """Return True."""
-        return True
-
-    @staticmethod
-    def name() -> str:
-        """Return the name of the kind."""
-        return pretend_device.NAME
-
-
-def one_device() -> SingleDeviceStrategy:
-    """Return what makes Lightning's Trainer use the device."""
-    return SingleDeviceStrategy(torch.device(pretend_device.DEVICE), accelerator=_Accelerator())

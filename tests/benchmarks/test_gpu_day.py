@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -31,7 +30,9 @@ def read(folder):
 def test_a_machine_without_a_gpu_is_told_so(tmp_path):
     done = run("--output", tmp_path / "day")
     assert done.returncode == 1
-    assert done.stderr.strip() == "gpu_day.py needs an NVIDIA GPU that this torch can use, and finds none here"
+    assert (
+        done.stderr.strip() == "gpu_day.py needs an NVIDIA GPU that this torch can use, and finds none here"
+    )
     assert not (tmp_path / "day").exists()
 
 
@@ -85,7 +86,7 @@ def test_the_whole_day_on_the_pretend_device(tmp_path):
         assert any(name.startswith(start) for name in timed), start
 
 
-BADLY = '''
+BADLY = """
 import importlib.util, sys
 from pathlib import Path
 
@@ -103,9 +104,9 @@ if "--steps" in sys.argv:
     day.run_here(sys.argv[sys.argv.index("--steps") + 1:], folder, "cuda")
 else:
     sys.exit(len(day.run_parts(list(day.PARTS), folder, "cuda")))
-'''
+"""
 
-MODULE = '''
+MODULE = """
 import os, signal, subprocess, sys, time
 
 def well(context):
@@ -127,7 +128,7 @@ def hangs(context):
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
     (context.output / "child").write_text(str(child.pid))
     time.sleep(600)
-'''
+"""
 
 STEPS = {"raises": "kernels", "dies": "waits", "hangs": "training", "well": "bars"}
 
@@ -190,8 +191,9 @@ def test_lines_that_a_crash_cut_short_are_left_out(tmp_path):
 
 
 @pytest.mark.slow
-def test_ranks_take_the_steps_of_one(tmp_path):
+def test_ranks_take_the_steps_of_one(tmp_path, monkeypatch):
     """What several GPUs are asked for, by two processes on the CPU."""
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
     from device import Device
     from gpu_day.checks import Checks, read_entries
     from gpu_day.context import Context, Sizes
@@ -213,4 +215,4 @@ def test_ranks_take_the_steps_of_one(tmp_path):
     (entry,) = read_entries(path)
     assert entry["check"]["verdict"] == "pass", entry
     assert "in 20 steps" in entry["check"]["measured"]
-    assert os.path.isfile(tmp_path / "several" / "finished.json")
+    assert (tmp_path / "several" / "finished.json").is_file()
