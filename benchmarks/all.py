@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Everything that this machine can measure, as CSV and pictures: ``python benchmarks/all.py --output DIR``.
 
-On an H200 about ten minutes. On a CPU the sizes are smaller (an hour on two cores; ``--quick`` five minutes).
+On a CPU the sizes are smaller (an hour on two cores; ``--quick`` five minutes). On a GPU it has never run: by
+estimate a quarter of an hour on an H200. ``gpu_day.py`` is the command that checks a machine.
 A benchmark that fails is said at the end and does not stop the others.
 """
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import os
 import statistics
 import time
 import traceback
@@ -196,13 +197,13 @@ class Gpu(Device):
         with torch.profiler.profile(activities=activities) as profile:
             yield count
             self.wait()
-        count.append(
-            sum(
-                event.count
-                for event in profile.key_averages()
-                if event.key.startswith(("cudaLaunchKernel", "cuLaunchKernel"))
-            )
+        launched = sum(
+            event.count
+            for event in profile.key_averages()
+            if event.key.startswith(("cudaLaunchKernel", "cuLaunchKernel"))
         )
+        if launched:  # a profiler without CUPTI sees none
+            count.append(launched)
 
 
 _RAYTRAN, _TORCH = (str(Path(package.__file__ or "").resolve().parent) for package in (raytran, torch))
@@ -218,5 +219,5 @@ def _place() -> str:
 
 
 def this_device() -> Device:
-    """Return the first GPU, without one the processor."""
-    return Gpu() if torch.cuda.is_available() else Device()
+    """Return the GPU of this rank, which is the first in a run of one, and without one the processor."""
+    return Gpu(int(os.environ.get("LOCAL_RANK", "0"))) if torch.cuda.is_available() else Device()

@@ -178,9 +178,9 @@ def random_batch(
     )
     return SceneBatch(
         tuple(f"scene{number}" for number in range(scenes)),
-        Views(images, *(pose.expand(scenes, *pose.shape) for pose in poses)),
+        Views(images, *(pose.repeat(scenes, 1, 1, 1) for pose in poses)),
         ((),) * scenes,
-        center.expand(scenes, 3),
+        center.repeat(scenes, 1),
         (objects,) * scenes if {"objects", "shapes"} & set(targets) else None,
         torch.rand(scenes, *model.grid_resolution) > 0.95 if "occupancy" in targets else None,
         torch.rand(*lead, *size) > 0.7 if "foreground" in targets else None,

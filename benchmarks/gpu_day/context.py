@@ -40,8 +40,8 @@ class Sizes:
         precisions: in which the tiny curriculum is trained.
         training: settings of it on top of its preset's.
         killed: more settings of the run that is killed.
-        losses: for each stage what its loss must come down to.
-        score: F1 at IoU 0.25 on its training rooms that a curriculum must reach.
+        losses: for each stage what its loss must come down to; ``benchmarks/README.md`` says from which runs.
+        score: F1 at IoU 0.25 on its training rooms that a curriculum must reach; from the same runs.
         prediction: settings of ``raytran.predict``.
     """
 

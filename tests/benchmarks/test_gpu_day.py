@@ -10,6 +10,17 @@ from pathlib import Path
 
 import pytest
 import torch
+from device import Device
+from fit import random_batch, step_config
+from gpu_day import environment
+from gpu_day.checks import Check, Checks, read_entries
+from gpu_day.context import Context, Sizes
+from gpu_day.report import Part, write_report
+from gpu_day.training import compare_ranks
+from torch.utils import backend_registration
+
+from raytran.run.build import build_model
+from raytran.run.camera_paths import walk
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 SCRIPT = BENCHMARKS / "gpu_day.py"
@@ -37,7 +48,12 @@ def test_a_machine_without_a_gpu_is_told_so(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(
+    not hasattr(backend_registration, "_setup_privateuseone_for_python_backend"),
+    reason="this torch takes no backend in Python",
+)
 def test_the_whole_day_on_the_pretend_device(tmp_path):
+    pytest.importorskip("triton", reason="Triton is not installed: the kernels have nothing to run on")
     done = run("--output", tmp_path, "--device", "pretend")
     report, checks = read(tmp_path)
     text = (tmp_path / "report.md").read_text()
@@ -159,9 +175,6 @@ def test_what_ends_badly_stops_nothing_else(tmp_path):
 
 
 def test_the_report_says_how_far_it_is(tmp_path):
-    from gpu_day.checks import Check
-    from gpu_day.report import Part, write_report
-
     check = Check("a | b", "≤ 1", "2", "FAIL", why="too\nmuch", notes=("a line",))
     parts = [
         Part("one", "First", [check, Check("c", "", "–", "not measured", "no GPU")], 61.0, "running"),
@@ -180,8 +193,6 @@ def test_the_report_says_how_far_it_is(tmp_path):
 
 
 def test_lines_that_a_crash_cut_short_are_left_out(tmp_path):
-    from gpu_day.checks import Checks, read_entries
-
     path = tmp_path / "checks.jsonl"
     assert read_entries(path) == []
     Checks(path).add("first", measured="1")
@@ -194,10 +205,6 @@ def test_lines_that_a_crash_cut_short_are_left_out(tmp_path):
 def test_ranks_take_the_steps_of_one(tmp_path, monkeypatch):
     """What several GPUs are asked for, by two processes on the CPU."""
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    from device import Device
-    from gpu_day.checks import Checks, read_entries
-    from gpu_day.context import Context, Sizes
-    from gpu_day.training import compare_ranks
 
     small = [
         "rooms.num_val=1",
@@ -216,3 +223,36 @@ def test_ranks_take_the_steps_of_one(tmp_path, monkeypatch):
     assert entry["check"]["verdict"] == "pass", entry
     assert "in 20 steps" in entry["check"]["measured"]
     assert (tmp_path / "several" / "finished.json").is_file()
+
+
+@pytest.mark.parametrize(
+    ("version", "verdict", "words"),
+    [
+        (90701, "pass", "9.7.1"),
+        (90800, "FAIL", "9.8.0"),
+        (91002, "FAIL", "9.10.2"),
+        (91500, "pass", "9.15.0"),
+    ],
+)
+def test_a_cudnn_that_torch_does_without_is_named(tmp_path, monkeypatch, version, verdict, words):
+
+    monkeypatch.setattr(torch.backends.cudnn, "version", lambda: version)
+    environment.examine(Context(Checks(tmp_path / "checks"), Device(), Sizes(), tmp_path))
+    checks = {e["check"]["name"]: e["check"] for e in read_entries(tmp_path / "checks") if "check" in e}
+    assert (checks["cuDNN"]["verdict"], checks["cuDNN"]["measured"]) == (verdict, words)
+    assert bool(checks["cuDNN"]["why"]) == (verdict == "FAIL")
+
+
+def test_a_random_scene_can_be_put_into_page_locked_memory():
+    """Which no tensor can that is expanded: some of its elements would be written to more than once."""
+
+    cfg = step_config("tiny", "stage3", Device(), ["model.grid_resolution=[4,4,4]"])
+    batch = random_batch(walk(2).scaled_to((32, 48)), build_model(cfg, pretrained=False), 2)
+
+    def check(tensor):
+        assert tensor.is_contiguous()
+        return tensor
+
+    parcels = [batch, batch.views, *batch.objects]
+    for parcel in parcels:
+        parcel._map(lambda item: check(item) if isinstance(item, torch.Tensor) else item)
