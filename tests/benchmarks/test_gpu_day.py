@@ -199,6 +199,8 @@ def test_lines_that_a_crash_cut_short_are_left_out(tmp_path):
     with path.open("a") as file:
         file.write('{"check": {"na')
     assert [entry["check"]["name"] for entry in read_entries(path)] == ["first"]
+    Checks(path).add("second", measured="2")
+    assert [entry["check"]["name"] for entry in read_entries(path)] == ["first", "second"]
 
 
 @pytest.mark.slow
