@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from raytran.losses.matcher import HungarianMatcher
-from raytran.types import ObjectSet
+from raytran.types import PADDING, ObjectSet, RawObjects
 
 WEIGHTS = {"class": 1.0, "center": 2.0, "size": 1.0, "yaw": 1.0}
 
@@ -25,6 +25,18 @@ def test_finds_a_planted_permutation(make_objects, make_perfect, blind) -> None:
         0: 3,
         4: 4,
     }
+
+
+def test_a_likely_class_costs_less(make_objects) -> None:
+    """Minus the probability of the object's class, so that what suits best costs least."""
+    objects = replace(make_objects(2), label=torch.tensor([3, 6]))
+    logits = torch.randn(1, 4, PADDING + 1, generator=torch.Generator().manual_seed(1))
+    logits[0, 2, 3] = 8.0
+    rest = [torch.zeros(1, 4, size) for size in (3, 3, 2, 4)]
+    matcher = HungarianMatcher(weights={"class": 1.0, "center": 0.0, "size": 0.0, "yaw": 0.0})
+    cost = matcher.cost(RawObjects(logits, *rest), 0, objects)
+    torch.testing.assert_close(cost, -logits[0].exp()[:, [3, 6]] / logits[0].exp().sum(dim=-1, keepdim=True))
+    assert int(cost[:, 0].argmin()) == 2
 
 
 def test_symmetric_turns_cost_nothing(make_objects, make_perfect) -> None:

@@ -79,6 +79,22 @@ def test_heat_loss_punishes_missed_centres_and_false_ones() -> None:
     assert heat_loss(lambda logits: logits[0, 2, 2, 1, 4].fill_(5.0)) == pytest.approx(5.0, rel=0.02)
 
 
+def test_a_box_is_learned_at_the_centre_and_at_the_voxels_beside_it() -> None:
+    """Heat is 0.36 a voxel away and 0.13 across an edge: above and below what a voxel must have."""
+    found = objects([0.25, 0.25, -0.25])  # the middle of voxel (2, 2, 1)
+    raw = perfect(found)
+    center = (raw.center + 0.5).requires_grad_()
+    moved = RawProposals(raw.anchor, raw.class_logits, center, raw.log_size, raw.yaw_vector)
+    proposal_losses(moved, [found], num_objects=torch.tensor(1.0))["center"].backward()
+    learns = (center.grad[0] != 0).all(dim=-1)
+    distance = (raw.anchor[0] - found.center[0]).norm(dim=-1) / 0.5
+    assert int(learns.sum()) == 7
+    assert torch.equal(learns, distance < 1.2)
+    # The gradient of smooth L1 is the voxel's weight there: its heat, all of an object's summing to one.
+    heat = torch.exp(-distance.square() / (2 * SPREAD**2)) * learns
+    torch.testing.assert_close(center.grad[0, ..., 0], heat / heat.sum())
+
+
 def test_a_scene_without_objects_still_reaches_every_output() -> None:
     raw = perfect(objects([0.0, 0.0, 0.0]))
     leaves = [value.clone().requires_grad_() for value in (raw.class_logits, raw.center)]

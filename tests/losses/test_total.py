@@ -13,7 +13,7 @@ from raytran.geometry.grid import VoxelGrid
 from raytran.heads.objects import ObjectHead
 from raytran.losses.matcher import HungarianMatcher
 from raytran.losses.total import TotalLoss
-from raytran.types import ObjectSet, RawObjects, RawProposals, RawScene, SceneBatch, Views
+from raytran.types import PADDING, ObjectSet, RawObjects, RawProposals, RawScene, SceneBatch, Views
 
 RawParcel = TypeVar("RawParcel", RawObjects, RawProposals)
 WEIGHTS = {
@@ -65,6 +65,26 @@ def test_pose_terms_are_means_over_objects(make_objects, make_perfect) -> None:
     assert float(total_loss()(scene, batch(objects), terms=("objects",))["objects/center"]) == pytest.approx(
         0.95
     )
+
+
+@pytest.mark.parametrize("padding", [0.1, 1.0, 0.0])
+def test_class_term_is_the_weighted_mean_over_all_slots(padding, make_objects) -> None:
+    """As torch's own mean with class weights: by the total weight of matched and of empty slots."""
+    scenes = [make_objects(count, seed) for seed, count in enumerate((2, 1))]
+    g = torch.Generator().manual_seed(5)
+    raw = RawObjects(*(torch.randn(2, 5, size, generator=g) for size in (10, 3, 3, 2, 4)))
+    matcher = HungarianMatcher(weights=WEIGHTS)
+    loss = TotalLoss(weights=WEIGHTS, matcher=matcher, no_object_weight=padding)
+    label = torch.full((2, 5), PADDING)
+    for scene, match in enumerate(matcher(raw, scenes)):
+        label[scene, match.slot] = scenes[scene].label[match.target]
+    weight = torch.ones(PADDING + 1)
+    weight[PADDING] = padding
+    expected = torch.nn.functional.cross_entropy(
+        raw.class_logits.flatten(0, 1), label.flatten(), weight=weight
+    )
+    found = loss(RawScene(torch.zeros(2, 3), objects=(raw,)), batch(*scenes), terms=("objects",))
+    torch.testing.assert_close(found["objects/class"], expected)
 
 
 def join(*parts: RawParcel) -> RawParcel:
