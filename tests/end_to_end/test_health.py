@@ -73,6 +73,21 @@ def test_a_strangers_loss_is_not_run(key, target, lost, tmp_path):
         replay(compose("replay", [f"file={tmp_path / 'replay.pt'}", "device=cpu"]))
 
 
+def test_a_network_of_ones_own_is_done_again_if_it_is_trusted(lost, tmp_path, monkeypatch):
+    folder, _ = lost
+    (tmp_path / "replayed_lab.py").write_text(
+        "from raytran.backbone.backbone import Backbone as B\nclass Own(B): pass\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    content = read_checkpoint(folder / "replay.pt")
+    content["model"]["backbone"]["_target_"] = "replayed_lab.Own"
+    torch.save(content, tmp_path / "replay.pt")
+    settings = [f"file={tmp_path / 'replay.pt'}", "device=cpu"]
+    with pytest.raises(CheckpointError, match=r"no network of raytran.* give trust=\[replayed_lab\]"):
+        replay(compose("replay", settings))
+    assert replay(compose("replay", [*settings, "trust=[replayed_lab]"])).parts[0].startswith("backbone.")
+
+
 def test_an_unknown_precision_is_one_sentence(lost):
     folder, _ = lost
     with pytest.raises(ConfigError, match="unknown precision=8: choose one of 32-true, bf16-mixed, 16-mixed"):

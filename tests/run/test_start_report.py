@@ -5,9 +5,14 @@ import re
 
 import pytest
 
-from raytran.run.build import build_model, build_module
+from raytran.run.build import build_model, build_module, plain
+from raytran.run.checkpoint import checkpoint_card
 from raytran.run.entry import compose
 from raytran.run.start_report import changed_settings, start_report
+
+
+def card(cfg, parent=None):
+    return checkpoint_card(stage=cfg.stage.name, preset=cfg.preset, config=plain(cfg), parent=parent)
 
 
 @pytest.mark.parametrize(
@@ -20,7 +25,7 @@ from raytran.run.start_report import changed_settings, start_report
 def test_parts_and_counts(experiment, trained, frozen, terms):
     cfg = compose("train", ["preset=tiny", f"experiment={experiment}", "output_dir=unused"])
     module = build_module(cfg, build_model(cfg))
-    first, second, third = start_report(module.stage, module.model, None)
+    first, second, third = start_report(module.stage, module.model, card(cfg))
     assert first.startswith("trains ")
     assert all(f" {name} " in first for name in trained)
     assert second.startswith("frozen ")
@@ -38,8 +43,20 @@ def test_the_parent_is_named_with_its_score():
     module = build_module(cfg, build_model(cfg))
     scores = {"val/occupancy/iou": 0.41234, "val/total": 3.0}
     parent = {"path": "a/last.ckpt", "stage": "occupancy", "step": 1500, "scores": scores}
-    last = start_report(module.stage, module.model, parent)[-1]
+    last = start_report(module.stage, module.model, card(cfg, parent))[-1]
     assert last == "starts from stage occupancy, step 1500, val/occupancy/iou 0.412: a/last.ckpt"
+
+
+def test_a_network_of_ones_own_says_what_its_checkpoints_need():
+    cfg = compose("train", ["preset=tiny", "output_dir=unused"])
+    module, known = build_module(cfg, build_model(cfg)), card(cfg)
+    known["model"]["backbone"]["_target_"] = "mylab.nets.MyBackbone"
+    known["model"]["heads"]["shape"]["_target_"] = "friends.Head"
+    line = start_report(module.stage, module.model, known)[-1]
+    assert line.startswith("this network has classes of friends, mylab: to use its checkpoints, evaluate, ")
+    assert line.endswith("need trust=[friends,mylab]")
+    assert start_report(module.stage, module.model, known, trust=["mylab"])[-1] == line
+    assert line not in start_report(module.stage, module.model, known, trust=["mylab", "friends"])
 
 
 def test_settings_that_change_in_a_resumed_run_are_named():

@@ -17,6 +17,7 @@ from raytran.run.folders import LAST
 from raytran.run.loggers import METRICS
 from raytran.run.settings import RunConfig
 from raytran.run.watch import watching_callbacks
+from raytran.run.weights import without_sources
 from raytran.training.callbacks.effective_batch import EffectiveBatch
 from raytran.training.callbacks.last_checkpoint import LastCheckpoint
 from raytran.training.callbacks.rank_agreement import RankAgreement
@@ -47,9 +48,7 @@ def build_model(cfg: DictConfig, *, pretrained: bool = True) -> RayTran:
         pretrained: False leaves out the image encoder's own weights, because a checkpoint will fill it.
     """
     config = plain(cfg.model)
-    if not pretrained:
-        config["backbone"]["resnet"]["weights"] = None
-    return instantiate(config, _convert_="all")
+    return instantiate(config if pretrained else without_sources(config), _convert_="all")
 
 
 def build_module(cfg: DictConfig, model: RayTran) -> Reconstruction:

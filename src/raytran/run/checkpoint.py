@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -50,19 +50,23 @@ def checkpoint_card(
     }
 
 
-def load_model(checkpoint: str | Path, *, attention: Attention = "auto") -> RayTran:
+def load_model(
+    checkpoint: str | Path, *, attention: Attention = "auto", trust: Iterable[str] = ()
+) -> RayTran:
     """Return the model of a checkpoint, in evaluation mode, on the CPU.
 
     Args:
         checkpoint: path of the file, or ``default`` for the weights that the package carries.
         attention: as in ``RayTran``; what the network was trained with does not matter.
+        trust: packages of your own whose classes the file may name, see ``trusted_packages``.
 
     Raises:
-        CheckpointError: the file is missing, damaged, or its weights do not fit the model described in it.
-        ConfigError: there is no such attention.
+        CheckpointError: the file is missing, damaged, or its weights do not fit the model described in it; or
+            that names a class of a package that is not trusted.
+        ConfigError: there is no such attention, or ``trust`` is no list of packages.
     """
     path = checkpoint_path(checkpoint)
-    model = model_from(read_checkpoint(path), path)
+    model = model_from(read_checkpoint(path), path, trust=trust)
     model.ray_tracer = RayTracer(attention)
     return model
 
@@ -104,21 +108,28 @@ def prediction_settings(checkpoint: str | Path) -> PredictionSettings:
     return PredictionSettings(card["preset"], card["stage"], (height, width), num_views)
 
 
-def model_from(checkpoint: Mapping[str, Any], path: Path) -> RayTran:
+def model_from(checkpoint: Mapping[str, Any], path: Path, *, trust: Iterable[str] = ()) -> RayTran:
     """Return the model of a checkpoint that was read from ``path`` already.
 
+    Args:
+        checkpoint: what ``read_checkpoint`` returned.
+        path: where from, for messages.
+        trust: packages of your own whose classes it may name, see ``trusted_packages``.
+
     Raises:
-        CheckpointError: the checkpoint describes no network of raytran, or its weights do not fit.
+        CheckpointError: the checkpoint describes no network of raytran or of a trusted package, or its
+            weights do not fit.
+        ConfigError: ``trust`` is no list of packages.
     """
     from raytran.model import RayTran
     from raytran.run.checkpoint_config import build_network
 
     with torch.device("meta"):  # the file's size, and not what it claims, decides how much memory is taken
-        shell = build_network(checkpoint["model"], path)
+        shell = build_network(checkpoint["model"], path, trust=trust)
     if not isinstance(shell, RayTran):
         raise CheckpointError(f"{path} describes only a part of a network: do not use this file")
     load_weights(shell, checkpoint, path, assign=True)
-    model = cast("RayTran", build_network(checkpoint["model"], path))
+    model = cast("RayTran", build_network(checkpoint["model"], path, trust=trust))
     load_weights(model, checkpoint, path)
     return model.eval()
 

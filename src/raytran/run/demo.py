@@ -19,6 +19,7 @@ from raytran.errors import ConfigError
 from raytran.model import RayTran
 from raytran.run.build import build_data, plain
 from raytran.run.checkpoint import load_model, prediction_settings
+from raytran.run.checkpoint_config import own_packages
 from raytran.run.curriculum import run_curriculum
 from raytran.run.demo_page import COLUMNS, ShownScene, headline, write_page
 from raytran.run.entry import compose
@@ -134,7 +135,9 @@ def _train(overrides: Sequence[str], folder: Path, times: StepTimes) -> list[Fit
 
 def _asked(overrides: Sequence[str], data: SceneDataModule, checkpoint: Path) -> dict[str, Asked]:
     """Return who is asked about what, by ``COLUMNS``: the package's weights too, if it has any."""
-    model = load_model(checkpoint)
+    # The network was composed from what is typed here, not out of a file: its own classes are trusted.
+    cfg = compose("train", [*overrides, *_SETTINGS, "output_dir=unused"])
+    model = load_model(checkpoint, trust=own_packages(plain(cfg.model)))
     asked = {split: Asked(model, checkpoint, data, split) for split in ("train", "val")}
     shipped = shipped_weights()
     if shipped is not None:

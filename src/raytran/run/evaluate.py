@@ -22,6 +22,7 @@ from raytran.metrics.curves import accuracy_by_scene_size
 from raytran.model import RayTran
 from raytran.run.build import build_data
 from raytran.run.checkpoint import PredictionSettings, load_model, prediction_settings
+from raytran.run.checkpoint_config import trusted_packages
 from raytran.run.device import choose_device
 from raytran.run.entry import compose
 from raytran.run.evaluate_views import FILES, evaluate_views, views_table
@@ -55,7 +56,8 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     output = Path(cfg.output)
     check_replaceable(output.resolve(), marker=MARKER)
     settings = prediction_settings(cfg.checkpoint)
-    model = load_model(cfg.checkpoint, attention=cfg.attention).to(choose_device(cfg.device))
+    model = load_model(cfg.checkpoint, attention=cfg.attention, trust=trusted_packages(cfg.trust))
+    model = model.to(choose_device(cfg.device))
     cfg = _in_its_preset(cfg, settings)
     # The stages before it leave the shape head untrained.
     tasks = TASKS_WITH_SHAPE if settings.stage == "shape" else TASKS

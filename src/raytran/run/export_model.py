@@ -15,6 +15,7 @@ from rich.table import Table
 from raytran.errors import ConfigError
 from raytran.run.build import plain
 from raytran.run.checkpoint import model_from, prediction_settings
+from raytran.run.checkpoint_config import trusted_packages
 from raytran.run.export_program import SUFFIX as PROGRAM_SUFFIX
 from raytran.run.export_program import export_program
 from raytran.run.weights import checkpoint_path, export_weights
@@ -42,7 +43,8 @@ def export_model(cfg: DictConfig) -> Path | None:
     output = Path(cfg.output)
     _check_output(source, output)
     checkpoint = read_checkpoint(source)
-    model = model_from(checkpoint, source)  # what cannot be loaded is not given away
+    # What cannot be loaded is not given away.
+    model = model_from(checkpoint, source, trust=trusted_packages(cfg.trust))
     if output.suffix == SUFFIX:
         export_weights(checkpoint, source, output, dtype=cfg.dtype)
     else:

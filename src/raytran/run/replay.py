@@ -20,6 +20,7 @@ from raytran.losses.total import TotalLoss
 from raytran.model import RayTran, inputs_of
 from raytran.parcel import Parcel
 from raytran.run.checkpoint import model_from
+from raytran.run.checkpoint_config import trusted_packages
 from raytran.run.device import choose_device
 from raytran.training.replay_file import read_replay
 from raytran.training.stage import Stage
@@ -56,7 +57,7 @@ def replay(cfg: DictConfig) -> Replayed:
     if precision not in PRECISIONS:
         raise ConfigError(f"unknown precision={precision}: choose one of {', '.join(PRECISIONS)}")
     device = choose_device(cfg.device)
-    model, loss, stage = _parts(content, path)
+    model, loss, stage = _parts(content, path, trusted_packages(cfg.trust))
     stage.freeze(model.to(device))
     stage.set_modes(model)
     found = run_step(
@@ -123,9 +124,11 @@ def _is_finite(value: Any) -> bool:
     return all(map(_is_finite, value)) if isinstance(value, tuple | list) else True
 
 
-def _parts(content: Mapping[str, Any], path: Path) -> tuple[RayTran, TotalLoss, Stage]:
-    """Return network, loss and stage; the file may come from anybody, so none of its classes is run."""
-    model = model_from(content, path)
+def _parts(
+    content: Mapping[str, Any], path: Path, trust: tuple[str, ...]
+) -> tuple[RayTran, TotalLoss, Stage]:
+    """Return network, loss and stage; the file may come from anybody, so only trusted classes are run."""
+    model = model_from(content, path, trust=trust)
     try:
         loss, stage = content["config"]["loss"], dict(content["config"]["stage"])
         if stage.pop("_target_") != "raytran.training.stage.Stage":

@@ -3,26 +3,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from raytran.model import RayTran
+from raytran.run.checkpoint_config import own_packages
 from raytran.training.stage import Stage
 
 _NOT_COMPUTED = {
     *("output_dir", "outputs", "resume", "init_from", "check_parent", "progress_bar", "logger", "launcher"),
-    *("stages", "debug", "sweep", "watch", "optimized_metric"),
+    *("stages", "debug", "sweep", "watch", "optimized_metric", "trust"),
 }
 """Top-level settings that say where and how a run goes on, not what it computes."""
 
 
-def start_report(stage: Stage, model: RayTran, parent: Mapping[str, Any] | None) -> list[str]:
+def start_report(
+    stage: Stage, model: RayTran, card: Mapping[str, Any], *, trust: Collection[str] = ()
+) -> list[str]:
     """Return the lines to log at the start of a fit.
 
     Args:
         stage: the stage; it is applied to ``model``, as the fit will do.
         model: the network.
-        parent: the checkpoint that the first weights come from, as it is written into checkpoints.
+        card: what the checkpoints will say of themselves, see ``checkpoint_card``.
+        trust: packages of which the user knows that the checkpoints need them to be trusted.
     """
     stage.freeze(model)
     trained: dict[str, int] = {}
@@ -36,6 +40,7 @@ def start_report(stage: Stage, model: RayTran, parent: Mapping[str, Any] | None)
         f"frozen {_listed(frozen)}",
         f"loss terms {', '.join(stage.terms)}; heads that run {', '.join(stage.tasks)}",
     ]
+    parent = card["parent"]
     if parent is not None:
         scores = parent["scores"]
         told = [
@@ -43,6 +48,12 @@ def start_report(stage: Stage, model: RayTran, parent: Mapping[str, Any] | None)
         ]
         at = f"stage {parent['stage']}, step {parent['step']}"
         lines.append(f"starts from {', '.join([at, *told])}: {parent['path']}")
+    own = own_packages(card["model"])
+    if not set(own) <= set(trust):
+        lines.append(
+            f"this network has classes of {', '.join(own)}: to use its checkpoints, evaluate, predict, "
+            f"export_model and replay need trust=[{','.join(own)}]"
+        )
     return lines
 
 

@@ -81,7 +81,7 @@ def _train(cfg: DictConfig, run: RunConfig, folder: Path) -> FitResult:
     if trainer.is_global_zero:
         _describe_run(cfg, folder)
     _log.info("stage %s, %d steps, in %s", module.stage.name, trainer.max_steps, folder)
-    for line in start_report(module.stage, module.model, parent):
+    for line in start_report(module.stage, module.model, card, trust=run.trust):
         _log.info("%s", line)
     began = time.monotonic()
     try:

@@ -83,18 +83,18 @@ def _card(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     parent = checkpoint.get("parent")
     if isinstance(parent, Mapping):
         card["parent"] = {name: parent.get(name) for name in ("stage", "step")}
-    return card | {"model": _without_sources(checkpoint["model"])}
+    return card | {"model": without_sources(checkpoint["model"])}
 
 
-def _without_sources(node: Any) -> Any:
-    """Leave out where first weights came from, which may be a path; those of the file take their place."""
+def without_sources(node: Any) -> Any:
+    """Return a network's config without where first weights come from: a checkpoint's take their place."""
     if isinstance(node, Mapping):
         is_object = "_target_" in node
         return {
-            name: None if is_object and name == "weights" else _without_sources(value)
+            name: None if is_object and name == "weights" else without_sources(value)
             for name, value in node.items()
         }
-    return [_without_sources(value) for value in node] if isinstance(node, list | tuple) else node
+    return [without_sources(value) for value in node] if isinstance(node, list | tuple) else node
 
 
 def _converted(value: Tensor, dtype: torch.dtype, name: str) -> Tensor:
