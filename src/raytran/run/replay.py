@@ -135,16 +135,18 @@ def _parts(
             raise KeyError("stage")
         if loss["_target_"] != "raytran.losses.total.TotalLoss":
             raise KeyError("loss")
-        matcher = HungarianMatcher(weights=loss["matcher"]["weights"])
-        total = TotalLoss(
-            weights=loss["weights"], matcher=matcher, no_object_weight=float(loss["no_object_weight"])
-        )
+        matcher = HungarianMatcher(**_without_target(loss["matcher"]))
+        total = TotalLoss(**_without_target(loss) | {"matcher": matcher})
         return model, total, Stage(**stage)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise CheckpointError(
             f"{path} was written with a stage or a loss of another kind than raytran's: replay it in Python "
             "with raytran.run.replay.run_step"
         ) from error
+
+
+def _without_target(node: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in node.items() if name != "_target_"}
 
 
 def _show(found: Replayed, title: str) -> None:
