@@ -8,6 +8,7 @@ import pytest
 from raytran.run.build import build_model, build_module, plain
 from raytran.run.checkpoint import checkpoint_card
 from raytran.run.entry import compose
+from raytran.run.known_data import KnownData
 from raytran.run.start_report import changed_settings, start_report
 
 
@@ -47,6 +48,21 @@ def test_the_parent_is_named_with_its_score():
     assert last == "starts from stage occupancy, step 1500, val/occupancy/iou 0.412: a/last.ckpt"
 
 
+def test_a_parent_on_other_data_is_said_in_one_line():
+    typed = ["preset=tiny", "experiment=stage2", "output_dir=unused"]
+    cfg = compose("train", [*typed, "data=scan2cad", "data.root=real"])
+    module = build_module(cfg, build_model(cfg))
+    parent = {"path": "a/last.ckpt", "stage": "occupancy", "step": 1500, "scores": {}}
+    rooms = KnownData.of_config(plain(compose("train", [*typed, "data.root=rooms"]))).as_plain()
+    line = "its parent was trained on other data, rooms in rooms; this run on scan2cad in real"
+    assert line in start_report(module.stage, module.model, card(cfg, parent | {"data": rooms}))
+    same = card(cfg)["data"]
+    for quiet in (parent, parent | {"data": None}, parent | {"data": same}):
+        assert not any(
+            "other data" in line for line in start_report(module.stage, module.model, card(cfg, quiet))
+        )
+
+
 def test_a_network_of_ones_own_says_what_its_checkpoints_need():
     cfg = compose("train", ["preset=tiny", "output_dir=unused"])
     module, known = build_module(cfg, build_model(cfg)), card(cfg)
@@ -72,4 +88,25 @@ def test_settings_that_change_in_a_resumed_run_are_named():
         "optimizer.learning_rate: 0.001 → 0.0001",
         "optimizer.decay: none → unset",
         "optimizer.warmup: unset → 5",
+    ]
+
+
+@pytest.mark.parametrize("experiment", ["stage2", "gt_masks_stage2"])
+def test_settings_that_came_later_are_no_change(experiment):
+    """A run from before there were keys for what it did goes on without a word, unless they say otherwise."""
+    typed = ["preset=tiny", f"experiment={experiment}", "output_dir=unused"]
+    before = plain(compose("train", typed))
+    for key in ("shape_layers", "center_beta", "yaw_beta"):
+        del before["loss"][key]
+    for key in ("class_cost", "center_beta", "yaw_beta"):
+        del before["loss"]["matcher"][key]
+    del before["data"]["name"], before["data"]["dataset"]["object_choice"]
+    before["data"]["dataset"]["input_mask"] = experiment != "stage2"
+    assert changed_settings(before, plain(compose("train", typed))) == []
+    more = ["loss.shape_layers=all", "data.dataset.object_choice=seen", "loss.yaw_beta=0.2"]
+    assert sorted(changed_settings(before, plain(compose("train", [*typed, *more])))) == [
+        "data.dataset.object_choice: all → seen",
+        "loss.matcher.yaw_beta: 0.1 → 0.2",
+        "loss.shape_layers: last → all",
+        "loss.yaw_beta: 0.1 → 0.2",
     ]

@@ -21,6 +21,7 @@ from raytran.run.weights import without_sources
 from raytran.training.callbacks.effective_batch import EffectiveBatch
 from raytran.training.callbacks.last_checkpoint import LastCheckpoint
 from raytran.training.callbacks.rank_agreement import RankAgreement
+from raytran.training.callbacks.repeated_frames import RepeatedFramesWarning
 from raytran.training.callbacks.stage_setup import StageSetup
 from raytran.training.callbacks.step_progress import StepProgress
 from raytran.training.checkpoint_io import AtomicCheckpointIO
@@ -101,6 +102,7 @@ def build_trainer(cfg: DictConfig, run: RunConfig, card: dict[str, Any]) -> pl.T
         StageSetup(),
         EffectiveBatch(per_device=cfg.data.batch_size, expected=cfg.schedule.batch),
         RankAgreement(),
+        RepeatedFramesWarning(),
         LastCheckpoint(folder / LAST, every_n_steps=run.checkpoint_every, card=card),
         *watching_callbacks(cfg, run, card),
     ]

@@ -14,6 +14,7 @@ import torch
 from raytran.errors import CheckpointError
 from raytran.ops.fused import Attention
 from raytran.ops.ray_tracer import RayTracer
+from raytran.run.known_data import KnownData
 from raytran.run.weights import checkpoint_path
 from raytran.training.checkpoint_content import FORMAT
 from raytran.training.checkpoint_file import read_checkpoint
@@ -24,7 +25,12 @@ if TYPE_CHECKING:
 
 
 def checkpoint_card(
-    *, stage: str, preset: str, config: Mapping[str, Any], parent: Mapping[str, Any] | None
+    *,
+    stage: str,
+    preset: str,
+    config: Mapping[str, Any],
+    parent: Mapping[str, Any] | None,
+    warnings: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return the plain Python that identifies a checkpoint.
 
@@ -33,7 +39,8 @@ def checkpoint_card(
         preset: name of the preset.
         config: all settings of the run, resolved; ``model`` rebuilds the network, ``views`` holds
             ``image_size`` [H, W], ``num_views`` in training and ``predict_views``.
-        parent: the checkpoint that the fit started from (``path``, ``stage``, ``step``, ``scores``), or None.
+        parent: the checkpoint that the fit started from, see ``Parent``, or None.
+        warnings: what anybody who uses the weights should know.
     """
     from raytran.run.provenance import git_commit, versions
 
@@ -44,10 +51,20 @@ def checkpoint_card(
         "model": copy.deepcopy(config["model"]),
         "views": copy.deepcopy(config["views"]),
         "config": copy.deepcopy(dict(config)),
+        "data": KnownData.of_config(config).as_plain(),
+        "input_mask": _input_mask(config),
         "parent": None if parent is None else dict(parent),
+        "warnings": list(warnings),
         "git_commit": git_commit(),
         "versions": versions(),
     }
+
+
+def _input_mask(config: Any) -> str | None:
+    """Return the mask that goes in as a fourth channel; checkpoints from before there were two say True."""
+    for name in ("data", "dataset", "input_mask"):
+        config = config.get(name) if isinstance(config, Mapping) else None
+    return "amodal" if config is True else config if isinstance(config, str) else None
 
 
 def load_model(
@@ -80,12 +97,14 @@ class PredictionSettings:
         stage: name of the stage.
         image_size: ``(H, W)``.
         num_views: frames to predict from (96 in the paper).
+        input_mask: mask that goes in as a fourth channel, see ``SceneDataset``; None if that is not known.
     """
 
     preset: str
     stage: str
     image_size: tuple[int, int]
     num_views: int
+    input_mask: str | None = None
 
 
 def prediction_settings(checkpoint: str | Path) -> PredictionSettings:
@@ -105,7 +124,8 @@ def prediction_settings(checkpoint: str | Path) -> PredictionSettings:
         num_views = int(views["predict_views"])
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path} does not say which images its network wants: it is damaged") from error
-    return PredictionSettings(card["preset"], card["stage"], (height, width), num_views)
+    mask = card.get("input_mask") or _input_mask(card.get("config"))
+    return PredictionSettings(card["preset"], card["stage"], (height, width), num_views, mask)
 
 
 def model_from(checkpoint: Mapping[str, Any], path: Path, *, trust: Iterable[str] = ()) -> RayTran:

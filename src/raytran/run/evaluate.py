@@ -17,6 +17,7 @@ from rich.progress import track
 from rich.table import Table
 from torch.utils.data import Dataset, Subset
 
+from raytran.data.views import RepeatedFrames
 from raytran.errors import ConfigError
 from raytran.metrics.curves import accuracy_by_scene_size
 from raytran.model import RayTran
@@ -28,6 +29,7 @@ from raytran.run.entry import compose
 from raytran.run.evaluate_views import FILES, evaluate_views, views_table
 from raytran.run.output import check_replaceable, replaced_folder
 from raytran.run.score import score, write_csv
+from raytran.training.datamodule import SceneDataModule
 from raytran.training.scores import DUPLICATE_IOU, SCORE_THRESHOLD, SceneScores
 from raytran.types import SceneBatch
 
@@ -64,11 +66,10 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     _make_data_fit(cfg, settings, model, tasks)
     data = build_data(cfg)
     data.prepare_data()
-    scenes, title = with_at_most(cfg.max_objects, data.split(cfg.split)), f"{cfg.split} scenes of {data.root}"
-    about = {
+    scenes = with_at_most(cfg.max_objects, data.split(cfg.split))
+    title = f"{cfg.split} scenes of {data.root}, {cfg.views.num_views} frames each"
+    about = about_data(data, cfg.split, cfg.views.num_views) | {
         "checkpoint": str(cfg.checkpoint),
-        "data": str(data.root),
-        "split": cfg.split,
         "max_objects": cfg.max_objects,
     }
     if settings.stage == "view":
@@ -89,6 +90,11 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     Console().print(metrics_table(metrics, title=f"{settings.preset}, {title}"))
     _log.info("wrote %s: metrics.json, per_scene.csv, per_object.csv", output.resolve())
     return metrics
+
+
+def about_data(data: SceneDataModule, split: str, num_views: int) -> dict[str, Any]:
+    """Return what ``metrics.json`` says of the scenes: data set, folder, split, and frames that went in."""
+    return {"dataset": data.name, "data": str(data.root), "split": split, "num_views": num_views}
 
 
 def _in_its_preset(cfg: DictConfig, settings: PredictionSettings) -> DictConfig:
@@ -113,8 +119,9 @@ def _make_data_fit(
     else:
         cfg.stage.new_views = 0
     cfg.model.grid_resolution, cfg.model.grid_extent = list(model.grid_resolution), list(model.grid_extent)
-    # One that was trained with the true masks as a fourth channel gets them here.
-    cfg.data.dataset.input_mask = model.backbone.resnet.input_channels == 4
+    # One that was trained with true masks as a fourth channel gets the same here, unless another is typed.
+    mask = cfg.data.dataset.input_mask or settings.input_mask or "amodal"
+    cfg.data.dataset.input_mask = mask if model.backbone.resnet.input_channels == 4 else None
 
 
 def with_at_most(max_objects: int | None, dataset: Any) -> Dataset[SceneBatch]:
@@ -176,8 +183,11 @@ def evaluate_model(
         volume_extent=model.grid_extent,
     ).to(device)
     model.eval()
+    repeated = RepeatedFrames()
     for index in track(range(len(dataset)), "evaluating", disable=not progress, transient=True):  # type: ignore[arg-type]
-        _predict_and_compare(model, dataset[index].to(device), scores, score_threshold, views_at_once)
+        batch = dataset[index]
+        repeated.look(batch)
+        _predict_and_compare(model, batch.to(device), scores, score_threshold, views_at_once)
     settings = {"score_threshold": score_threshold, "duplicate_iou": duplicate_iou}
     metrics = {**(about or {}), **settings, **_by_protocol(scores)}
     if output is not None:

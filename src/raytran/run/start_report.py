@@ -8,6 +8,7 @@ from typing import Any
 
 from raytran.model import RayTran
 from raytran.run.checkpoint_config import own_packages
+from raytran.run.known_data import KnownData
 from raytran.training.stage import Stage
 
 _NOT_COMPUTED = {
@@ -15,6 +16,21 @@ _NOT_COMPUTED = {
     *("stages", "debug", "sweep", "watch", "optimized_metric", "trust"),
 }
 """Top-level settings that say where and how a run goes on, not what it computes."""
+
+
+_BEFORE_THEY_WERE_KEYS = {
+    "loss.shape_layers": "last",
+    "loss.center_beta": 0.1,
+    "loss.yaw_beta": 0.1,
+    "loss.matcher.class_cost": "probability",
+    "loss.matcher.center_beta": 0.1,
+    "loss.matcher.yaw_beta": 0.1,
+    "data.dataset.object_choice": "all",
+}
+"""What runs did whose checkpoints do not have these settings yet."""
+
+_WAS_CALLED = {"data.dataset.input_mask": {True: "amodal", False: None}}
+"""Values that had other names in earlier checkpoints."""
 
 
 def start_report(
@@ -48,6 +64,10 @@ def start_report(
         ]
         at = f"stage {parent['stage']}, step {parent['step']}"
         lines.append(f"starts from {', '.join([at, *told])}: {parent['path']}")
+        known, data = KnownData.of_plain(parent.get("data")), KnownData.of_plain(card["data"])
+        if known is not None and data is not None and not known.is_same(data):
+            lines.append(f"its parent was trained on other data, {known}; this run on {data}")
+    lines += [f"WARNING: {warning}" for warning in card["warnings"]]
     own = own_packages(card["model"])
     if not set(own) <= set(trust):
         lines.append(
@@ -68,6 +88,12 @@ def changed_settings(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[
         dict(_leaves({name: value for name, value in settings.items() if name not in _NOT_COMPUTED}))
         for settings in (before, now)
     )
+    old = {name: value for name, value in _BEFORE_THEY_WERE_KEYS.items() if name in new} | old
+    for name, names in _WAS_CALLED.items():
+        if isinstance(old.get(name), bool):
+            old[name] = names[bool(old[name])]
+    if "data.name" not in old:
+        new.pop("data.name", None)
     names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
     return [f"{name}: {old.get(name, 'unset')} → {new.get(name, 'unset')}" for name in names]
 

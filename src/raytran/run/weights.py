@@ -22,7 +22,10 @@ FOLDER = Path(raytran.__file__).resolve().parent / "weights"
 
 DTYPES = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
 
-_KEPT = ("format", "stage", "preset", "model", "views", "scores", "global_step", "git_commit", "versions")
+_KEPT = (
+    *("format", "stage", "preset", "model", "views", "input_mask", "scores", "global_step", "warnings"),
+    *("git_commit", "versions"),
+)
 """Of what a checkpoint says. The rest is the state of training, and settings that hold a machine's paths."""
 
 
@@ -83,6 +86,9 @@ def _card(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     parent = checkpoint.get("parent")
     if isinstance(parent, Mapping):
         card["parent"] = {name: parent.get(name) for name in ("stage", "step")}
+    data = checkpoint.get("data")
+    if isinstance(data, Mapping):
+        card["data"] = {name: data.get(name) for name in ("name", "annotation")}
     return card | {"model": without_sources(checkpoint["model"])}
 
 
