@@ -21,6 +21,7 @@ from raytran.data.views import RepeatedFrames
 from raytran.errors import ConfigError
 from raytran.metrics.curves import accuracy_by_scene_size
 from raytran.model import RayTran
+from raytran.run.accuracy_figure import Curves, draw_figure, read_curves
 from raytran.run.build import build_data
 from raytran.run.checkpoint import PredictionSettings, load_model, prediction_settings
 from raytran.run.checkpoint_config import trusted_packages
@@ -32,6 +33,7 @@ from raytran.run.score import score, write_csv
 from raytran.training.datamodule import SceneDataModule
 from raytran.training.scores import DUPLICATE_IOU, SCORE_THRESHOLD, SceneScores
 from raytran.types import SceneBatch
+from raytran.view.accuracy_curves import FILE as FIGURE
 
 _log = logging.getLogger(__name__)
 
@@ -53,8 +55,9 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     """
     if (cfg.checkpoint is None) == (cfg.predictions is None):
         raise ConfigError("give either checkpoint=CKPT or predictions=DIR annotations=FILE, not both")
+    beside = read_curves(cfg.draw_with)
     if cfg.predictions is not None:
-        return score(cfg)
+        return score(cfg, beside)
     output = Path(cfg.output)
     check_replaceable(output.resolve(), marker=MARKER)
     settings = prediction_settings(cfg.checkpoint)
@@ -86,9 +89,10 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
         duplicate_iou=cfg.duplicate_iou,
         views_at_once=cfg.views_at_once,
         about=about,
+        beside=beside,
     )
     Console().print(metrics_table(metrics, title=f"{settings.preset}, {title}"))
-    _log.info("wrote %s: metrics.json, per_scene.csv, per_object.csv", output.resolve())
+    _log.info("wrote %s: metrics.json, per_scene.csv, per_object.csv, %s", output.resolve(), FIGURE)
     return metrics
 
 
@@ -152,7 +156,8 @@ def evaluate_model(
     score_threshold: float = SCORE_THRESHOLD,
     duplicate_iou: float | None = DUPLICATE_IOU,
     views_at_once: int | None = None,
-    about: Mapping[str, str] | None = None,
+    about: Mapping[str, Any] | None = None,
+    beside: Mapping[str, Curves] | None = None,
     progress: bool = True,
 ) -> dict[str, Any]:
     """Predict every scene of a data set and compare with its annotation.
@@ -162,12 +167,13 @@ def evaluate_model(
         dataset: scenes with targets, each a ``SceneBatch`` with B = 1.
         tasks: what to compare: ``TASKS``, or with the shapes of the objects found ``TASKS_WITH_SHAPE``, for
             which the scenes must have shapes.
-        output: folder for ``metrics.json``, ``per_scene.csv`` and ``per_object.csv``, which appear together
-            or not at all; None writes nothing.
+        output: folder for ``metrics.json``, ``per_scene.csv``, ``per_object.csv`` and
+            ``accuracy_curves.png``, which appear together or not at all; None writes nothing.
         score_threshold: objects with a lower score do not count as predicted.
         duplicate_iou: nor does one that overlaps a surer one of its class by more than this IoU.
         views_at_once: views that pass through the network together, None for all.
         about: what to say beside the numbers, e.g. the checkpoint.
+        beside: accuracy curves of other results for the figure, by name.
         progress: show a progress bar.
 
     Returns:
@@ -195,6 +201,7 @@ def evaluate_model(
             (folder / MARKER).write_text(json.dumps(metrics, indent=2) + "\n")
             write_csv(folder / "per_scene.csv", scores.rows("scene"))
             write_csv(folder / "per_object.csv", scores.rows("object"))
+            draw_figure(folder, output.name, metrics["strict"]["curves"], beside or {})
     return metrics
 
 

@@ -89,9 +89,9 @@ def changed_settings(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[
         for settings in (before, now)
     )
     old = {name: value for name, value in _BEFORE_THEY_WERE_KEYS.items() if name in new} | old
-    for name, names in _WAS_CALLED.items():
-        if isinstance(old.get(name), bool):
-            old[name] = names[bool(old[name])]
+    for setting, renamed in _WAS_CALLED.items():
+        if isinstance(old.get(setting), bool):
+            old[setting] = renamed[bool(old[setting])]
     if "data.name" not in old:
         new.pop("data.name", None)
     names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
