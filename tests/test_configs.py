@@ -33,6 +33,7 @@ FIXED_BY_LAYOUT = {"scans_root", "scene_ids", "annotations", "shapenet_root"}
 NO_CHOICE_OF_THE_PAPER = {
     "weights",  # a class must not reach for the network unasked; the preset does
     "num_workers",  # the machine's
+    "name",  # of the data set that is chosen
     "augmentation",  # a node that says what could be done, all of it off
 }
 # Only a choice of a large signature is written out.

@@ -118,7 +118,7 @@ def test_the_papers_ablations_are_what_they_say():
     assert "foreground" not in {*module.stage.tasks, *module.stage.terms, *config.data.targets}
     config = compose("train", ["preset=raytran", "experiment=gt_masks_stage3", "output_dir=x"])
     assert build_model(config, pretrained=False).backbone.resnet.input_channels == 4
-    assert config.data.dataset.input_mask
+    assert config.data.dataset.input_mask == "amodal"
 
 
 @pytest.mark.parametrize("path", files("trainer"), ids=name)

@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
     from pathlib import Path
 
     from raytran.model import RayTran
@@ -13,17 +14,21 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 
-def load(checkpoint: str | Path = "default") -> RayTran:
+def load(checkpoint: str | Path = "default", *, trust: Iterable[str] = ()) -> RayTran:
     """Return the model of a checkpoint, in evaluation mode, on the CPU.
 
     Args:
         checkpoint: a ``.ckpt`` file that training wrote, a ``.safetensors`` file that was exported from one,
             or ``default`` for the weights that the package carries (``raytran/weights/README.md``).
+        trust: top-level packages of your own whose networks the file may name, e.g. ``("mylab",)``: they are
+            imported and run. A file can never add to them.
 
     Raises:
-        CheckpointError: the file is missing or damaged, or the package was built without weights.
+        CheckpointError: the file is missing or damaged, or names a class of a package that is not trusted, or
+            the package was built without weights.
+        ConfigError: ``trust`` is no list of packages.
     """
     # Imported here so that ``import raytran`` stays light.
     from raytran.run.checkpoint import load_model
 
-    return load_model(checkpoint)
+    return load_model(checkpoint, trust=trust)

@@ -54,6 +54,21 @@ def test_images_are_normalised_as_imagenets() -> None:
     torch.testing.assert_close(seen["images"][0, :, 0, 0], torch.tensor([2.24890, 2.42857, 2.64000]))
 
 
+@pytest.mark.parametrize("kind", [ResNet18, EfficientNetLite0])
+def test_a_mask_is_left_as_it_is(kind) -> None:
+    """Beside normalised colours the fourth channel is 0 and 1."""
+    torch.manual_seed(0)
+    encoder = kind(input_channels=4)
+    backbone, seen = Backbone(resnet=encoder, channels=8, num_heads=2, num_blocks=1).eval(), {}
+    backbone.resnet.register_forward_pre_hook(lambda _, inputs: seen.update(images=inputs[0]))
+    images = torch.randint(0, 256, (1, 2, 4, 32, 32), dtype=torch.uint8)
+    images[:, :, 3] = 255 * (images[:, :, 3] > 99)
+    backbone(images, **scene())
+    assert torch.equal(seen["images"][:, 3], (images[0, :, 3] == 255).float())
+    mean, std = (torch.tensor(v)[:, None, None] for v in (encoder.image_mean, encoder.image_std))
+    torch.testing.assert_close(seen["images"][:, :3], (images[0, :, :3] / 255 - mean) / std)
+
+
 def test_features_do_not_depend_on_where_the_world_has_its_origin() -> None:
     backbone, images = make_backbone(), torch.rand(1, 2, 3, 32, 32)
     here, there = backbone(images, **scene()), backbone(images, **scene((30.0, -8.0, 2.0)))

@@ -64,7 +64,7 @@ def test_only_targets_that_were_asked_for(cube_dataset) -> None:
 
 
 def test_mask_as_input(cube_dataset) -> None:
-    sample = open_dataset(cube_dataset, targets=("foreground",), input_mask=True)[0]
+    sample = open_dataset(cube_dataset, targets=("foreground",), input_mask="amodal")[0]
     assert sample.views.images.shape == (1, 2, 4, 32, 48)
     assert torch.equal(sample.views.images[:, :, 3], sample.foreground.byte() * 255)
 

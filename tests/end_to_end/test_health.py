@@ -7,9 +7,10 @@ import pytest
 import torch
 
 from raytran.errors import CheckpointError, ConfigError
+from raytran.run.build import plain
 from raytran.run.entry import compose
 from raytran.run.folders import LAST
-from raytran.run.replay import replay
+from raytran.run.replay import _parts, replay
 from raytran.training.checkpoint_file import read_checkpoint
 
 
@@ -71,6 +72,43 @@ def test_a_strangers_loss_is_not_run(key, target, lost, tmp_path):
     torch.save(content, tmp_path / "replay.pt")
     with pytest.raises(CheckpointError, match="a stage or a loss of another kind"):
         replay(compose("replay", [f"file={tmp_path / 'replay.pt'}", "device=cpu"]))
+
+
+def test_the_loss_is_that_of_the_run(lost, tmp_path):
+    """With every choice it had; one from before a choice could be made has what was done then."""
+    folder, _ = lost
+    content = read_checkpoint(folder / "replay.pt")
+    stage = plain(compose("train", ["experiment=stage2", "output_dir=unused"]).stage)
+    content["config"]["stage"] = stage
+    loss = content["config"]["loss"]
+    _, total, _ = _parts(content, folder, ())
+    assert (total.shape_layers, total.betas, total.matcher.class_cost) == ("last", (0.1, 0.1), "probability")
+    loss |= {"shape_layers": "all", "center_beta": 0.4}
+    loss["matcher"] |= {"class_cost": "cross_entropy", "yaw_beta": 0.3}
+    _, total, _ = _parts(content, folder, ())
+    assert (total.shape_layers, total.betas) == ("all", (0.4, 0.1))
+    assert (total.matcher.class_cost, total.matcher.betas) == ("cross_entropy", (0.1, 0.3))
+    for name in ("shape_layers", "center_beta", "yaw_beta"):
+        del loss[name]
+    for name in ("class_cost", "center_beta", "yaw_beta"):
+        del loss["matcher"][name]
+    _, total, _ = _parts(content, folder, ())
+    assert (total.shape_layers, total.betas, total.matcher.class_cost) == ("last", (0.1, 0.1), "probability")
+
+
+def test_a_network_of_ones_own_is_done_again_if_it_is_trusted(lost, tmp_path, monkeypatch):
+    folder, _ = lost
+    (tmp_path / "replayed_lab.py").write_text(
+        "from raytran.backbone.backbone import Backbone as B\nclass Own(B): pass\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    content = read_checkpoint(folder / "replay.pt")
+    content["model"]["backbone"]["_target_"] = "replayed_lab.Own"
+    torch.save(content, tmp_path / "replay.pt")
+    settings = [f"file={tmp_path / 'replay.pt'}", "device=cpu"]
+    with pytest.raises(CheckpointError, match=r"no network of raytran.* give trust=\[replayed_lab\]"):
+        replay(compose("replay", settings))
+    assert replay(compose("replay", [*settings, "trust=[replayed_lab]"])).parts[0].startswith("backbone.")
 
 
 def test_an_unknown_precision_is_one_sentence(lost):

@@ -46,6 +46,19 @@ def test_shapes_of_every_layer() -> None:
         assert objects.embedding.shape == (2, 6, 24)
 
 
+@pytest.mark.parametrize("refines", ["center", "box"])
+@pytest.mark.parametrize("windowed", [False, True])
+def test_later_layers_teach_earlier_ones_where_to_look(refines, windowed) -> None:
+    """Reference points are refined with gradients: the last centre's reaches the first layer's offset."""
+    head = small_head(refines=refines, windowed=windowed, num_layers=3)
+    last(head, torch.randn(1, 4, 4, 2, 24), grid_at([0.0, 0, 0])).center.sum().backward()
+    for predictor in head.predictors:
+        # Offsets add up: a layer's bias moves all six queries' last centres along with its own.
+        bias = predictor.offset[-1].bias.grad
+        assert bias is not None
+        assert bool((bias.abs() > 1).all())
+
+
 def test_centers_move_with_the_grid() -> None:
     head, voxels = small_head(), torch.randn(1, 4, 4, 2, 24)
     here, there = last(head, voxels, grid_at([0.0, 0, 0])), last(head, voxels, grid_at([10.0, -20, 5]))

@@ -6,8 +6,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from raytran.errors import ConfigError
 from raytran.losses.matcher import HungarianMatcher
-from raytran.types import ObjectSet
+from raytran.types import PADDING, ObjectSet, RawObjects
 
 WEIGHTS = {"class": 1.0, "center": 2.0, "size": 1.0, "yaw": 1.0}
 
@@ -24,6 +25,53 @@ def test_finds_a_planted_permutation(make_objects, make_perfect, blind) -> None:
         9: 2,
         0: 3,
         4: 4,
+    }
+
+
+def test_a_likely_class_costs_less(make_objects) -> None:
+    """Minus the probability of the object's class, so that what suits best costs least."""
+    objects = replace(make_objects(2), label=torch.tensor([3, 6]))
+    logits = torch.randn(1, 4, PADDING + 1, generator=torch.Generator().manual_seed(1))
+    logits[0, 2, 3] = 8.0
+    rest = [torch.zeros(1, 4, size) for size in (3, 3, 2, 4)]
+    matcher = HungarianMatcher(weights={"class": 1.0, "center": 0.0, "size": 0.0, "yaw": 0.0})
+    cost = matcher.cost(RawObjects(logits, *rest), 0, objects)
+    torch.testing.assert_close(cost, -logits[0].exp()[:, [3, 6]] / logits[0].exp().sum(dim=-1, keepdim=True))
+    assert int(cost[:, 0].argmin()) == 2
+
+
+def test_the_class_may_cost_its_cross_entropy(make_objects) -> None:
+    """A slot that is sure of a wrong class then loses its object to one that is nowhere near."""
+    objects = replace(make_objects(1), label=torch.tensor([3]))
+    logits = torch.zeros(1, 2, PADDING + 1)
+    logits[0, 0, 6] = 12.0  # slot 0 stands where the object does, slot 1 a metre away
+    center = objects.center + torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    raw = RawObjects(
+        logits, center[None], objects.size.log().expand(1, 2, 3), torch.zeros(1, 2, 2), torch.zeros(1, 2, 4)
+    )
+    chosen = {}
+    for class_cost in ("probability", "cross_entropy"):
+        matcher = HungarianMatcher(weights=WEIGHTS, class_cost=class_cost)
+        chosen[class_cost] = int(matcher(raw, [objects])[0].slot)
+    assert chosen == {"probability": 0, "cross_entropy": 1}
+    only_class = HungarianMatcher(weights=WEIGHTS | {"center": 0, "yaw": 0}, class_cost="cross_entropy")
+    expected = torch.nn.functional.cross_entropy(logits[0], torch.tensor([3, 3]), reduction="none")
+    torch.testing.assert_close(only_class.cost(raw, 0, objects)[:, 0], expected)
+    with pytest.raises(ConfigError, match="unknown class_cost=focal: choose one of probability, cross_ent"):
+        HungarianMatcher(weights=WEIGHTS, class_cost="focal")
+
+
+def test_betas_count_in_the_cost(make_objects, make_perfect) -> None:
+    objects = make_objects(1)
+    raw = make_perfect(objects, torch.tensor([0]), 1)
+    moved = replace(raw, center=raw.center + torch.tensor([0.4, 0.0, 0.0]))
+    cost = {
+        beta: float(HungarianMatcher(weights=WEIGHTS, center_beta=beta).cost(moved, 0, objects).detach())
+        for beta in (0.0, 0.1, 0.8)
+    }
+    # Minus the class's probability, 1, plus twice the smooth L1 of 0.4 m.
+    assert cost == {
+        beta: pytest.approx(2 * value - 1, abs=1e-4) for beta, value in ((0.0, 0.4), (0.1, 0.35), (0.8, 0.1))
     }
 
 

@@ -8,6 +8,7 @@ import torch
 
 from raytran.losses.matcher import Match
 from raytran.losses.objects import object_losses
+from raytran.losses.pose import Betas
 
 
 @pytest.mark.parametrize("no_object_weight", [1.0, 0.1])
@@ -25,6 +26,7 @@ def test_padding_is_weighted(make_objects, make_perfect, no_object_weight: float
             num_objects=torch.tensor(1.0),
             class_weight=torch.tensor(1 + 2 * no_object_weight),
             no_object_weight=no_object_weight,
+            betas=Betas(),
         )
         return float(found["class"].detach())
 

@@ -6,8 +6,9 @@ import math
 import pytest
 import torch
 
+from raytran.errors import ConfigError
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.losses.pose import pose_errors, yaw_from_vector
+from raytran.losses.pose import Betas, pose_errors, yaw_from_vector
 from raytran.types import ObjectSet
 
 
@@ -23,13 +24,14 @@ def one_object(*, yaw: float = 0.0, symmetry: int = 1) -> ObjectSet:
 
 
 def errors(
-    target: ObjectSet, *, shift: float = 0.0, ratio: float = 1.0, yaw: float = 0.0
+    target: ObjectSet, *, shift: float = 0.0, ratio: float = 1.0, yaw: float = 0.0, betas: Betas | None = None
 ) -> dict[str, float]:
     found = pose_errors(
         target.center + torch.tensor([shift, 0.0, 0.0]),
         (target.size * torch.tensor([ratio, 1.0, 1.0])).log(),
         3.0 * torch.tensor([[math.sin(yaw), math.cos(yaw)]]),
         target,
+        Betas() if betas is None else betas,
     )
     return {name: float(value) for name, value in found.items()}
 
@@ -40,6 +42,26 @@ def test_values() -> None:
     assert errors(one_object(), shift=0.05)["center"] == pytest.approx(0.0125, rel=1e-4)
     assert errors(one_object(), ratio=1.5)["size"] == pytest.approx(math.log(1.5), rel=1e-5)
     assert errors(one_object(), yaw=0.5)["yaw"] == pytest.approx(0.45)
+
+
+@pytest.mark.parametrize("center", [0.0, 0.1, 0.5, 2.0])
+@pytest.mark.parametrize("yaw", [0.0, 0.3, 1.0])
+def test_betas_say_where_a_square_becomes_a_line(center: float, yaw: float) -> None:
+    def smooth_l1(error: float, beta: float) -> float:
+        return error**2 / (2 * beta) if error < beta else error - beta / 2
+
+    betas = Betas(center, yaw)
+    for error in (0.01, 0.2, 0.45, 1.5):
+        found = errors(one_object(), shift=error, ratio=1.5, yaw=error, betas=betas)
+        assert found["center"] == pytest.approx(smooth_l1(error, center), rel=1e-4, abs=1e-6)
+        assert found["yaw"] == pytest.approx(smooth_l1(error, yaw), rel=1e-4, abs=1e-6)
+        assert found["size"] == pytest.approx(math.log(1.5), rel=1e-5)
+
+
+@pytest.mark.parametrize("betas", [Betas(center=-0.1), Betas(yaw=math.inf), Betas(center=math.nan)])
+def test_betas_are_checked(betas: Betas) -> None:
+    with pytest.raises(ConfigError, match=r"_beta=.*at least 0"):
+        betas.checked()
 
 
 def test_perfect_prediction_costs_nothing() -> None:

@@ -9,6 +9,7 @@ import torch
 
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.rotation import rotation_from_yaw
+from raytran.losses.pose import Betas
 from raytran.losses.proposals import SPREAD, center_heat, proposal_losses
 from raytran.types import ObjectSet, RawProposals
 
@@ -53,11 +54,11 @@ def test_heat_is_one_where_the_centre_lies_and_a_gaussian_around() -> None:
 def test_perfect_proposals_cost_nothing_and_wrong_ones_their_error() -> None:
     found = objects([0.3, 0.2, -0.1], [-0.6, -0.7, 0.4])
     best = perfect(found)
-    losses = proposal_losses(best, [found], num_objects=torch.tensor(2.0))
+    losses = proposal_losses(best, [found], num_objects=torch.tensor(2.0), betas=Betas())
     assert all(float(value) < 1e-5 for value in losses.values())
     moved = RawProposals(best.anchor, best.class_logits, best.center + 0.5, best.log_size, best.yaw_vector)
     # Smooth L1 beyond 0.1 m: error minus half of that, over three axes, mean over objects.
-    shifted = proposal_losses(moved, [found], num_objects=torch.tensor(2.0))
+    shifted = proposal_losses(moved, [found], num_objects=torch.tensor(2.0), betas=Betas())
     assert float(shifted["center"]) == pytest.approx(3 * 0.45, rel=1e-5)
 
 
@@ -69,7 +70,7 @@ def test_heat_loss_punishes_missed_centres_and_false_ones() -> None:
         logits = best.class_logits.clone()
         change(logits)
         raw = RawProposals(best.anchor, logits, best.center, best.log_size, best.yaw_vector)
-        return float(proposal_losses(raw, [found], num_objects=torch.tensor(1.0))["heat"])
+        return float(proposal_losses(raw, [found], num_objects=torch.tensor(1.0), betas=Betas())["heat"])
 
     assert heat_loss(lambda logits: logits[0, 2, 2, 1, 0].fill_(-5.0)) == pytest.approx(5.0, rel=0.02)
     far = heat_loss(lambda logits: logits[0, 0, 0, 3, 0].fill_(5.0))
@@ -79,6 +80,22 @@ def test_heat_loss_punishes_missed_centres_and_false_ones() -> None:
     assert heat_loss(lambda logits: logits[0, 2, 2, 1, 4].fill_(5.0)) == pytest.approx(5.0, rel=0.02)
 
 
+def test_a_box_is_learned_at_the_centre_and_at_the_voxels_beside_it() -> None:
+    """Heat is 0.36 a voxel away and 0.13 across an edge: above and below what a voxel must have."""
+    found = objects([0.25, 0.25, -0.25])  # the middle of voxel (2, 2, 1)
+    raw = perfect(found)
+    center = (raw.center + 0.5).requires_grad_()
+    moved = RawProposals(raw.anchor, raw.class_logits, center, raw.log_size, raw.yaw_vector)
+    proposal_losses(moved, [found], num_objects=torch.tensor(1.0), betas=Betas())["center"].backward()
+    learns = (center.grad[0] != 0).all(dim=-1)
+    distance = (raw.anchor[0] - found.center[0]).norm(dim=-1) / 0.5
+    assert int(learns.sum()) == 7
+    assert torch.equal(learns, distance < 1.2)
+    # The gradient of smooth L1 is the voxel's weight there: its heat, all of an object's summing to one.
+    heat = torch.exp(-distance.square() / (2 * SPREAD**2)) * learns
+    torch.testing.assert_close(center.grad[0, ..., 0], heat / heat.sum())
+
+
 def test_a_scene_without_objects_still_reaches_every_output() -> None:
     raw = perfect(objects([0.0, 0.0, 0.0]))
     leaves = [value.clone().requires_grad_() for value in (raw.class_logits, raw.center)]
@@ -86,6 +103,7 @@ def test_a_scene_without_objects_still_reaches_every_output() -> None:
         RawProposals(raw.anchor, leaves[0], leaves[1], raw.log_size, raw.yaw_vector),
         [objects()],
         num_objects=torch.tensor(1.0),
+        betas=Betas(),
     )
     sum(losses.values()).backward()
     assert all(leaf.grad is not None for leaf in leaves)

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import TypeVar
 
 import pytest
@@ -13,7 +13,7 @@ from raytran.geometry.grid import VoxelGrid
 from raytran.heads.objects import ObjectHead
 from raytran.losses.matcher import HungarianMatcher
 from raytran.losses.total import TotalLoss
-from raytran.types import ObjectSet, RawObjects, RawProposals, RawScene, SceneBatch, Views
+from raytran.types import PADDING, ObjectSet, RawObjects, RawProposals, RawScene, SceneBatch, Views
 
 RawParcel = TypeVar("RawParcel", RawObjects, RawProposals)
 WEIGHTS = {
@@ -65,6 +65,26 @@ def test_pose_terms_are_means_over_objects(make_objects, make_perfect) -> None:
     assert float(total_loss()(scene, batch(objects), terms=("objects",))["objects/center"]) == pytest.approx(
         0.95
     )
+
+
+@pytest.mark.parametrize("padding", [0.1, 1.0, 0.0])
+def test_class_term_is_the_weighted_mean_over_all_slots(padding, make_objects) -> None:
+    """As torch's own mean with class weights: by the total weight of matched and of empty slots."""
+    scenes = [make_objects(count, seed) for seed, count in enumerate((2, 1))]
+    g = torch.Generator().manual_seed(5)
+    raw = RawObjects(*(torch.randn(2, 5, size, generator=g) for size in (10, 3, 3, 2, 4)))
+    matcher = HungarianMatcher(weights=WEIGHTS)
+    loss = TotalLoss(weights=WEIGHTS, matcher=matcher, no_object_weight=padding)
+    label = torch.full((2, 5), PADDING)
+    for scene, match in enumerate(matcher(raw, scenes)):
+        label[scene, match.slot] = scenes[scene].label[match.target]
+    weight = torch.ones(PADDING + 1)
+    weight[PADDING] = padding
+    expected = torch.nn.functional.cross_entropy(
+        raw.class_logits.flatten(0, 1), label.flatten(), weight=weight
+    )
+    found = loss(RawScene(torch.zeros(2, 3), objects=(raw,)), batch(*scenes), terms=("objects",))
+    torch.testing.assert_close(found["objects/class"], expected)
 
 
 def join(*parts: RawParcel) -> RawParcel:
@@ -143,6 +163,62 @@ def test_shape_is_decoded_for_matched_slots_only(make_objects, make_perfect) -> 
     assert sorted(asked[0]) == [1.0, 3.0]
     assert set(losses) == {"shape", "total"}
     assert float(losses["shape"]) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("terms", [("shape",), ("objects", "shape")])
+def test_all_layers_may_tell_shapes(make_objects, make_perfect, terms) -> None:
+    """Each by its own matches: against sums of torch's own cross entropies over the slots that are right."""
+    objects = make_objects(2)
+    slots = [torch.tensor(of_layer) for of_layer in ([3, 1], [0, 2], [2, 3])]
+    layers = tuple(make_perfect(objects, of_layer, 4) for of_layer in slots)
+    decode = torch.nn.Sequential(torch.nn.Linear(4, 125), torch.nn.Unflatten(1, (5, 5, 5)))
+
+    def losses(**options: str) -> dict[str, torch.Tensor]:
+        loss = TotalLoss(weights=WEIGHTS, matcher=HungarianMatcher(weights=WEIGHTS), **options)
+        scene = RawScene(torch.zeros(1, 3), objects=layers)
+        return loss(scene, batch(objects), terms=terms, decode_shapes=decode)
+
+    usual, every = losses(), losses(shape_layers="all")
+    assert set(every) - set(usual) == {"shape/layer0", "shape/layer1"}
+    assert all(torch.equal(every[name], value) for name, value in usual.items() if name != "total")
+    for name, layer, of_layer in zip(("shape/layer0", "shape/layer1", "shape"), layers, slots, strict=True):
+        expected = torch.nn.functional.binary_cross_entropy_with_logits(
+            decode(layer.embedding[0, of_layer]), objects.shape.float()
+        )
+        torch.testing.assert_close(every[name], expected)
+    added = WEIGHTS["shape"] * (every["shape/layer0"] + every["shape/layer1"])
+    torch.testing.assert_close(every["total"], usual["total"] + added)
+    with pytest.raises(ConfigError, match="unknown shape_layers=first: choose one of last, all"):
+        losses(shape_layers="first")
+
+
+def test_betas_count_in_every_term_of_poses(make_objects, make_perfect) -> None:
+    """Decoder layers, proposals and noisy copies, each 0.4 m off along one axis."""
+    objects = make_objects(1)
+    shift = torch.tensor([0.4, 0.0, 0.0])
+    raw = make_perfect(objects, torch.tensor([0]), 2)
+    raw = replace(raw, center=raw.center + shift)
+    anchor = objects.center.expand(1, 3, 3, 3, 3) + torch.stack(
+        torch.meshgrid(*[torch.arange(-1.0, 2.0)] * 3, indexing="ij"), dim=-1
+    )
+    yaw = raw.yaw_vector[:, :1]
+    proposals = RawProposals(
+        anchor,
+        torch.zeros(1, 3, 3, 3, 9),
+        (objects.center + shift).expand(1, 3, 3, 3, 3),
+        objects.size.log().expand(1, 3, 3, 3, 3),
+        yaw[0].expand(27, 2).reshape(1, 3, 3, 3, 2),
+    )
+    copy = make_perfect(objects, torch.tensor([0]), 1)
+    copy = replace(copy, center=copy.center + shift)
+    scene = RawScene(torch.zeros(1, 3), objects=(raw, raw), proposals=proposals, copies=(copy,))
+    for beta, expected in ((0.1, 0.35), (0.8, 0.1), (0.0, 0.4)):
+        loss = TotalLoss(weights=WEIGHTS, matcher=HungarianMatcher(weights=WEIGHTS), center_beta=beta)
+        losses = loss(scene, batch(objects), terms=("objects",))
+        for place in ("", "/layer0", "/proposals", "/copies"):
+            assert float(losses[f"objects/center{place}"].detach()) == pytest.approx(expected, rel=1e-4), (
+                place
+            )
 
 
 @pytest.mark.parametrize("terms", [("objects",), ("objects", "shape")])

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -43,3 +44,25 @@ def trained(tmp_path_factory):
     path = folder / "last.ckpt"
     write_checkpoint(path, {**card, **more, "state_dict": {**state, "loss.scale": torch.ones(1)}})
     return Trained(path, model)
+
+
+@pytest.fixture
+def mylab(tmp_path, monkeypatch):
+    """A package of the user's own, with networks and other things in it."""
+    (tmp_path / "mylab").mkdir()
+    (tmp_path / "mylab" / "__init__.py").write_text(
+        "from torch.nn import Linear\nfrom mylab.nets import Head, MyBackbone\n"
+        "def run(**_): raise SystemExit('run')\nclass Settings:\n    def __init__(self, **_): run()\n"
+    )
+    (tmp_path / "mylab" / "nets.py").write_text(
+        "from raytran.backbone.backbone import Backbone\nfrom raytran.heads.shape import ShapeHead\n"
+        "class MyBackbone(Backbone): pass\n"
+        "class Head(ShapeHead):\n"
+        "    def __init__(self, *, attention, weights, **settings):\n"
+        "        super().__init__(**settings)\n        self.told = attention, weights\n"
+    )
+    (tmp_path / "broken.py").write_text("import no_such_package\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    yield
+    for name in [name for name in sys.modules if name.partition(".")[0] in ("mylab", "broken")]:
+        del sys.modules[name]

@@ -8,10 +8,10 @@ import sys
 
 import pytest
 
-from raytran.errors import CheckpointError
+from raytran.errors import CheckpointError, ConfigError
 from raytran.model import RayTran
 from raytran.run.build import plain
-from raytran.run.checkpoint_config import build_network
+from raytran.run.checkpoint_config import build_network, own_packages
 from raytran.run.entry import compose
 
 
@@ -121,3 +121,68 @@ def test_settings_that_do_not_fit_are_one_sentence(config, place, value):
 def test_a_part_is_no_network(config):
     with pytest.raises(CheckpointError, match="no network"):
         build_network({"channels": 3}, "a.ckpt")
+
+
+@pytest.mark.parametrize("target", ["mylab.MyBackbone", "mylab.nets.MyBackbone"])
+def test_a_package_that_the_user_trusts_may_be_named(config, mylab, target):
+    own = changed(config, "backbone._target_", target)
+    with pytest.raises(CheckpointError, match=r"no network of raytran: do not use .* give trust=\[mylab\]$"):
+        build_network(own, "a.ckpt")
+    assert "mylab" not in sys.modules
+    for trust in (["mylab"], ("other", "mylab")):
+        network = build_network(own, "a.ckpt", trust=trust)
+        assert type(network.backbone).__name__ == "MyBackbone"
+    with pytest.raises(CheckpointError, match="do not use this file"):
+        build_network(own, "a.ckpt", trust=["my", "nets", "mylab_"])
+
+
+def test_arguments_of_ones_own_keep_their_names(config, mylab):
+    """``attention`` is a word of raytran's networks; only that of weights to start from holds for all."""
+    shape = config["heads"]["shape"] | {"_target_": "mylab.Head", "attention": "local", "weights": "a.pth"}
+    network = build_network(changed(config, "heads.shape", shape), "a.ckpt", trust=["mylab"])
+    assert network.heads["shape"].told == ("local", None)
+
+
+@pytest.mark.parametrize(
+    "target",
+    ["mylab.run", "mylab.Settings", "mylab.Linear", "mylab.Missing", "mylab.missing.Head", "mylab.nets"],
+)
+def test_only_networks_of_a_trusted_package_are_built(config, mylab, target):
+    """No functions, no other classes, none that it has only imported from elsewhere."""
+    with pytest.raises(
+        CheckpointError, match=r"there is no torch\.nn\.Module of that name in mylab: set PYTHONP"
+    ):
+        build_network(changed(config, "backbone._target_", target), "a.ckpt", trust=["mylab"])
+
+
+def test_trust_is_never_taken_from_the_file(config, marked):
+    """Wherever a file says it: the stranger is not even imported."""
+    own = changed(config, "backbone._target_", "stranger.run")
+    for place in ("trust", "backbone.trust", "heads.trust"):
+        with pytest.raises(CheckpointError, match="do not use this file"):
+            build_network(changed(own, place, ["stranger"]), "a.ckpt", trust=["mylab"])
+    assert not marked.exists()
+
+
+def test_what_a_trusted_package_lacks_is_its_own_error(config, mylab):
+    with pytest.raises(ModuleNotFoundError, match="no_such_package"):
+        build_network(changed(config, "backbone._target_", "broken.Net"), "a.ckpt", trust=["broken"])
+    with pytest.raises(CheckpointError, match=r"set PYTHONPATH so that Python finds the absent it was"):
+        build_network(changed(config, "backbone._target_", "absent.Net"), "a.ckpt", trust=["absent"])
+    wrong = changed(changed(config, "backbone._target_", "mylab.MyBackbone"), "backbone.depth", 3)
+    with pytest.raises(
+        CheckpointError, match="the file is of another version of raytran or mylab, or damaged"
+    ):
+        build_network(wrong, "a.ckpt", trust=["mylab"])
+
+
+@pytest.mark.parametrize("trust", ["mylab", ["mylab.nets"], [3], 5, {"mylab": True}, [""]])
+def test_trust_is_a_list_of_packages(config, trust):
+    with pytest.raises(ConfigError, match=r"is no list of top-level packages: write it as trust=\[mylab\]"):
+        build_network(config, "a.ckpt", trust=trust)
+
+
+def test_packages_that_a_network_names(config):
+    assert own_packages(config) == ()
+    own = changed(changed(config, "backbone._target_", "b.nets.Net"), "heads.extra", [{"_target_": "a.Head"}])
+    assert own_packages(own) == ("a", "b")

@@ -9,8 +9,12 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 
 from raytran.errors import ConfigError
-from raytran.run.demo import demo
+from raytran.run.build import build_data, build_model, plain
+from raytran.run.checkpoint import checkpoint_card
+from raytran.run.demo import _asked, demo
+from raytran.run.entry import compose
 from raytran.run.weights import shipped_weights
+from raytran.training.checkpoint_file import write_checkpoint
 
 FEW = [
     "rooms.num_train=1",
@@ -33,6 +37,21 @@ FEW = [
 def config(output, *more: str) -> DictConfig:
     values = {"preset": "tiny", "overrides": [*FEW, *more], "score_threshold": 0.5, "duplicate_iou": 0.25}
     return OmegaConf.create({"output": str(output), **values})
+
+
+def test_a_network_of_ones_own_is_trusted_because_it_was_typed(tmp_path, mylab):
+    typed = [
+        *FEW,
+        "preset=tiny",
+        "model.backbone._target_=mylab.MyBackbone",
+        f"data.root={tmp_path / 'rooms'}",
+    ]
+    cfg = compose("train", [*typed, "experiment=stage3", "output_dir=unused"])
+    card = checkpoint_card(stage="shape", preset="tiny", config=plain(cfg), parent=None)
+    state = {f"model.{name}": value for name, value in build_model(cfg).state_dict().items()}
+    write_checkpoint(tmp_path / "last.ckpt", {**card, "state_dict": state})
+    asked = _asked(typed, build_data(cfg), tmp_path / "last.ckpt")
+    assert type(asked["train"].model.backbone).__module__ == "mylab.nets"
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from raytran.run.folders import (
     FINISHED,
     LAST,
     PREVIOUS,
-    newest_finished,
+    finished_runs,
     newest_unfinished,
     one_at_a_time,
     read_finished,
@@ -44,6 +44,18 @@ def test_a_mark_is_read_back(tmp_path):
     )
 
 
+def test_a_mark_says_what_the_run_was_trained_on(tmp_path):
+    known = {"name": "rooms", "root": "data/rooms", "annotation": "ab12", "made": {"seed": 0}}
+    names = {"stage": "joint", "preset": "small", "experiment": "stage2", "steps": 7}
+    assert write_finished(tmp_path, **names, data=known).data == known
+    assert read_finished(tmp_path).data == known
+    # One from before that was written down can be read too.
+    mark = json.loads((tmp_path / FINISHED).read_text())
+    del mark["data"]
+    (tmp_path / FINISHED).write_text(json.dumps(mark))
+    assert read_finished(tmp_path).data is None
+
+
 def test_no_mark_is_none(tmp_path):
     assert read_finished(tmp_path) is None
 
@@ -54,20 +66,22 @@ def test_a_damaged_mark_is_one_sentence(tmp_path):
         read_finished(tmp_path)
 
 
-def test_the_newest_finished_run_of_a_stage_is_found(tmp_path):
-    make_run(tmp_path / "tiny" / "stage1" / "a", finished="2026-01-03")
+def test_the_finished_runs_of_a_stage_are_found_newest_first(tmp_path):
+    older = make_run(tmp_path / "tiny" / "stage1" / "a", finished="2026-01-03")
     newest = make_run(tmp_path / "tiny" / "curriculum" / "b" / "stage1", finished="2026-01-04")
-    make_run(tmp_path / "tiny" / "stage1" / "c", finished="2026-01-01")
+    oldest = make_run(tmp_path / "tiny" / "stage1" / "c", finished="2026-01-01")
     make_run(tmp_path / "tiny" / "stage1" / "unfinished")
     make_run(tmp_path / "tiny" / "stage2" / "d", stage="joint", finished="2026-01-05")
     make_run(tmp_path / "small" / "stage1" / "e", preset="small", finished="2026-01-06")
-    assert newest_finished(tmp_path, preset="tiny", stage="occupancy") == newest / LAST
+    found = finished_runs(tmp_path, preset="tiny", stage="occupancy")
+    assert [path for path, _ in found] == [newest / LAST, older / LAST, oldest / LAST]
+    assert [mark.time for _, mark in found] == ["2026-01-04", "2026-01-03", "2026-01-01"]
 
 
 def test_a_finished_run_without_its_checkpoint_does_not_count(tmp_path):
     run = make_run(tmp_path / "tiny" / "stage1" / "a", finished="2026-01-03")
     (run / LAST).unlink()
-    assert newest_finished(tmp_path, preset="tiny", stage="occupancy") is None
+    assert finished_runs(tmp_path, preset="tiny", stage="occupancy") == []
 
 
 def test_the_newest_unfinished_run_is_found(tmp_path):
@@ -118,5 +132,5 @@ def test_resume_from_a_loose_file_is_one_sentence(tmp_path):
 def test_a_parent_is_a_run_of_the_experiment_that_was_asked_for(tmp_path):
     run = make_run(tmp_path / "tiny" / "stage1" / "a", finished="2026-01-01")
     asked = {"preset": "tiny", "stage": "occupancy"}
-    assert newest_finished(tmp_path, experiment="stage1", **asked) == run / LAST
-    assert newest_finished(tmp_path, experiment="gt_masks_stage1", **asked) is None
+    assert [path for path, _ in finished_runs(tmp_path, experiment="stage1", **asked)] == [run / LAST]
+    assert finished_runs(tmp_path, experiment="gt_masks_stage1", **asked) == []

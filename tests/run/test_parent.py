@@ -9,10 +9,15 @@ from pathlib import Path
 import pytest
 
 from raytran.errors import CheckpointError, ConfigError
+from raytran.run.build import plain
+from raytran.run.checkpoint import checkpoint_card
 from raytran.run.entry import compose
+from raytran.run.folders import LAST, write_finished
+from raytran.run.known_data import KnownData
 from raytran.run.parent import Parent, check_parent, find_parent
 from raytran.run.settings import RunConfig
 from raytran.run.train import _stage
+from raytran.training.checkpoint_file import write_checkpoint
 
 
 def stage(experiment, *more):
@@ -91,27 +96,63 @@ def test_what_is_remembered_of_a_parent():
         "stage": "occupancy",
         "step": 7,
         "scores": {"val/occupancy/iou": 0.5, "step": 6.0},
+        "data": None,
     }
+    known = {"name": "rooms", "root": "r", "annotation": "ab", "made": {"seed": 0}}
+    assert Parent.of(Path("p.ckpt"), content | {"data": known}).data == known
     assert Parent.of(Path("p.ckpt"), {"stage": "occupancy"}).scores == {}
     for odd in ({"scores": {"a": "b"}}, {"global_step": "many"}):
         with pytest.raises(CheckpointError, match=r"p\.ckpt"):
             Parent.of(Path("p.ckpt"), {"stage": "occupancy", **odd})
 
 
-def test_where_a_parent_is_looked_for(tmp_path):
-    def find(experiment, *more):
-        settings = [
-            "preset=tiny",
-            f"experiment={experiment}",
-            "output_dir=unused",
-            f"outputs={tmp_path}",
-            *more,
-        ]
-        cfg = compose("train", settings)
-        return find_parent(RunConfig.read(cfg), _stage(cfg))
+def find(outputs, experiment, *more):
+    settings = ["preset=tiny", f"experiment={experiment}", "output_dir=unused", f"outputs={outputs}", *more]
+    cfg = compose("train", settings)
+    found = find_parent(RunConfig.read(cfg), _stage(cfg), KnownData.of_config(plain(cfg)))
+    return None if found is None else found[0]
 
-    assert find("stage1") is None
-    assert find("stage2", "init_from=none") is None
-    assert find("stage1", "init_from=a.ckpt") == Path("a.ckpt")
+
+def finished(outputs, name, data, *, old=False):
+    """A finished stage 1; an old one does not say in its mark what it was trained on."""
+    run = outputs / "tiny" / "stage1" / name
+    config = plain(compose("train", ["preset=tiny", "output_dir=unused", *data]))
+    card = checkpoint_card(stage="occupancy", preset="tiny", config=config, parent=None)
+    write_checkpoint(run / LAST, {**card, "state_dict": {}})
+    known = None if old else card["data"]
+    write_finished(run, stage="occupancy", preset="tiny", experiment="stage1", steps=4, data=known)
+    return run / LAST
+
+
+def test_where_a_parent_is_looked_for(tmp_path):
+    assert find(tmp_path, "stage1") is None
+    assert find(tmp_path, "stage2", "init_from=none") is None
+    with pytest.raises(CheckpointError, match=r"no checkpoint at .*a\.ckpt"):
+        find(tmp_path, "stage1", f"init_from={tmp_path / 'a.ckpt'}")
     with pytest.raises(ConfigError, match=r"`python -m raytran\.train experiment=stage2 preset=tiny` first"):
-        find("stage3")
+        find(tmp_path, "stage3")
+
+
+@pytest.mark.parametrize("old", [False, True])
+def test_a_parent_on_other_data_is_passed_over(tmp_path, old):
+    rooms, real = ["data.root=rooms"], ["data=scan2cad", "data.root=real"]
+    other = finished(tmp_path, "a", rooms, old=old)
+    with pytest.raises(ConfigError) as refused:
+        find(tmp_path, "stage2", *real)
+    said = str(refused.value)
+    assert "was trained on scan2cad in real, only on other data (" in said
+    assert f"{other} on rooms in rooms)" in said
+    assert (
+        "run `python -m raytran.train experiment=stage1 preset=tiny data=scan2cad data.root=real` first"
+        in said
+    )
+    assert "init_from=CHECKPOINT to start from other data all the same" in said
+    assert find(tmp_path, "stage2", *real, f"init_from={other}") == other
+    assert find(tmp_path, "stage2", *rooms) == other
+    own = finished(tmp_path, "b", real, old=old)
+    finished(tmp_path, "c", rooms, old=old)
+    assert find(tmp_path, "stage2", *real) == own, "not the newest, which is on rooms"
+    with pytest.raises(
+        ConfigError, match=r"last\.ckpt on scan2cad in real and 1 more|rooms in rooms and 2 more"
+    ):
+        find(tmp_path, "stage2", "data=rooms-v1")

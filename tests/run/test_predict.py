@@ -89,7 +89,7 @@ def oracle(monkeypatch) -> Oracle:
     model = Oracle()
     settings = PredictionSettings(preset="tiny", stage="shape", image_size=IMAGE_SIZE, num_views=96)
     monkeypatch.setattr(module, "prediction_settings", lambda path: settings)
-    monkeypatch.setattr(module, "load_model", lambda path, attention: model)
+    monkeypatch.setattr(module, "load_model", lambda path, attention, trust: model)
     return model
 
 
@@ -116,6 +116,7 @@ def config(folder, output, **changes) -> DictConfig:
         "views_at_once": 4,
         "device": "cpu",
         "attention": "auto",
+        "trust": [],
     }
     return OmegaConf.create(values | changes)
 

@@ -15,6 +15,7 @@ from PIL import Image
 from raytran.errors import ConfigError, DataError
 from raytran.run.entry import compose
 from raytran.run.evaluate import evaluate
+from raytran.view import accuracy_curves
 
 CHAIR, TABLE, SOFA, LAMP = "03001627", "04379243", "04256520", "03636649"
 UPRIGHT = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
@@ -120,6 +121,62 @@ def test_strict(files):
     assert found["curves"]["translation"]["global_average"][at_10_cm] == pytest.approx(2 / 5)
     assert found["by_scene_size"]["10"]["n_total"] == 5
     assert 0 <= found["confidence"]["global_average"]["low"] <= 0.6 <= 0.75
+
+
+def drawn(monkeypatch):
+    """Names and lines of the figures that are drawn from now on."""
+    found = []
+    real = accuracy_curves.accuracy_figure
+    monkeypatch.setattr(
+        accuracy_curves, "accuracy_figure", lambda results: found.append(dict(results)) or real(results)
+    )
+    return found
+
+
+def test_the_curves_are_drawn_too(files, capsys, caplog, monkeypatch):
+    figures = drawn(monkeypatch)
+    with caplog.at_level("INFO", "raytran"):
+        found = run(files)
+    assert "accuracy_curves.png" in caplog.text
+    with Image.open(files / "out" / "accuracy_curves.png") as picture:
+        assert picture.format == "PNG"
+    assert figures == [{"out": found["strict"]["curves"]}]
+
+
+def test_other_results_are_drawn_beside(files, monkeypatch):
+    """Those of other predictions, and those of folders written before, by their names."""
+    (files / "worse").mkdir()
+    (files / "worse" / "a.csv").write_text(ROWS[0])
+    earlier = run(files, predictions="worse", output="earlier")["strict"]["curves"]
+    figures = drawn(monkeypatch)
+    settings = [f"compare={files / 'worse'}", f"draw_with=[{files / 'earlier'}]"]
+    own = run(files, *settings)["strict"]["curves"]
+    (figure,) = figures
+    assert list(figure) == [str(files / "csv"), str(files / "worse"), str(files / "earlier")]
+    assert list(figure.values()) == [own, earlier, earlier]
+    assert own != earlier
+
+
+@pytest.mark.parametrize("content", [None, "", "[]", "{}", '{"strict": {"curves": {"translation": {}}}}'])
+def test_folders_without_curves_are_one_sentence(files, content):
+    (files / "earlier").mkdir()
+    if content is not None:
+        (files / "earlier" / "metrics.json").write_text(content)
+    with pytest.raises(ConfigError, match=r"earlier/metrics\.json has no curves of protocol strict to draw"):
+        run(files, f"draw_with=[{files / 'earlier'}]")
+    assert not (files / "out").exists()
+
+
+def test_without_the_strict_protocol_there_is_no_figure(files):
+    run(files, "protocol=odam")
+    assert not (files / "out" / "accuracy_curves.png").exists()
+
+
+def test_metrics_say_which_files(files):
+    (files / "split.txt").write_text("a\nb\n")
+    found = run(files, f"split={files / 'split.txt'}")
+    assert (found["predictions"], found["split"]) == (str(files / "csv"), str(files / "split.txt"))
+    assert run(files)["split"] is None
 
 
 def test_scan2cad(files):

@@ -14,6 +14,7 @@ from raytran.errors import CheckpointError
 from raytran.run import weights as module
 from raytran.run.checkpoint import load_model, prediction_settings
 from raytran.run.entry import compose
+from raytran.run.known_data import KnownData
 from raytran.run.parent import find_parent
 from raytran.run.settings import RunConfig
 from raytran.run.weights import DEFAULT, FOLDER, checkpoint_path, export_weights
@@ -36,7 +37,9 @@ def test_default_means_the_file_of_the_package(shipped):
     assert prediction_settings("default") == prediction_settings(shipped)
     config = compose("train", ["experiment=stage3", "preset=tiny", "init_from=default", "output_dir=x"])
     stage = instantiate(config.stage, _convert_="all")
-    assert find_parent(RunConfig.read(config), stage) == shipped
+    found = find_parent(RunConfig.read(config), stage, KnownData(None, None))
+    assert found is not None
+    assert found[0] == shipped
 
 
 def test_default_is_what_predict_and_load_take(shipped):

@@ -58,6 +58,9 @@ class EfficientNetLite0(nn.Module):
             same, but random with a warning where the package is absent), or a file with a state dict under
             its names. Needed only at construction.
 
+    Attributes:
+        random_fallback: the weights are random because ``"auto"`` found none.
+
     Raises:
         ConfigError: the stride is neither 16 nor 8, ``num_stages`` is not 3 to 7 (4 to 7 for stride 16), or a
             frozen network is to have a fourth channel.
@@ -91,6 +94,7 @@ class EfficientNetLite0(nn.Module):
         self.stride = stride
         self.frozen = frozen
         self.input_channels = input_channels
+        self.random_fallback = False
         self.out_channels = _STAGES[num_stages - 1][-1]
         self.conv_stem = SameConv2d(input_channels, _STEM, 3, stride=2)
         self.bn0 = _norm(_STEM)
@@ -122,6 +126,7 @@ class EfficientNetLite0(nn.Module):
         if weights in ("imagenet", "auto"):
             found = imagenet_or_random(imagenet_weights, required=weights == "imagenet")
             if found is None:
+                self.random_fallback = True
                 return
             path = found
         name = "EfficientNet-Lite0"

@@ -63,6 +63,9 @@ class ResNet18(nn.Module):
             random with a warning where they cannot be fetched), or a file with a state dict under
             torchvision's names, with or without ``fc``. Needed only at construction.
 
+    Attributes:
+        random_fallback: the weights are random because ``"auto"`` found none.
+
     Raises:
         ConfigError: the width is too small, weights are given for another width than 64, or the stride is
             neither 16 nor 8.
@@ -89,6 +92,7 @@ class ResNet18(nn.Module):
             raise ConfigError(f"resnet stride must be 8 or 16, got {stride}")
         self.stride = stride
         self.input_channels = input_channels
+        self.random_fallback = False
         self.out_channels = 8 * width
         self.conv1 = nn.Conv2d(input_channels, width, 7, stride=2, padding=3, bias=False)
         self.bn1 = nn.BatchNorm2d(width)
@@ -119,6 +123,7 @@ class ResNet18(nn.Module):
         if weights in ("imagenet", "auto"):
             state = imagenet_or_random(_fetch_imagenet, required=weights == "imagenet")
             if state is None:
+                self.random_fallback = True
                 return
         else:
             remedy = (

@@ -16,10 +16,16 @@ from torch.utils.data import Dataset
 from raytran.data.augment import Augmentation
 from raytran.data.cache import MaskCache
 from raytran.data.images import MIN_VIEWS
-from raytran.data.scan2cad import SceneAnnotation, read_annotations, scene_objects
+from raytran.data.scan2cad import SceneAnnotation, annotation_path, read_annotations, scene_objects
 from raytran.data.scannet import Scan, scan_views
 from raytran.data.scene_list import ObjectTable, RecentScans, annotated, choose_scenes, read_split
-from raytran.data.targets import foreground_masks, scene_occupancy, shape_grids
+from raytran.data.targets import (
+    foreground_masks,
+    scene_occupancy,
+    seen_objects,
+    shape_grids,
+    visible_masks,
+)
 from raytran.data.views import choose_even, choose_random, hold_out
 from raytran.errors import ConfigError, DataError
 from raytran.geometry.camera import Cameras
@@ -28,6 +34,12 @@ from raytran.types import ObjectSet, SceneBatch, Views
 
 TARGETS: tuple[str, ...] = ("objects", "shapes", "occupancy", "foreground")
 """Targets a data set can give; "shapes" gives the objects too."""
+
+OBJECT_CHOICES = ("all", "in_volume", "seen")
+INPUT_MASKS = ("amodal", "visible")
+
+SCAN_MESH = "{}_vh_clean_2.ply"
+"""Name of a scan's mesh in ScanNet's release."""
 
 _MEMORY_OF_SCANS = 64 * 2**20
 """Bytes in which each process keeps cameras and file names: 300,000 frames, all of ScanNet at 200 a scan."""
@@ -72,7 +84,11 @@ class SceneDataset(Dataset[SceneBatch]):
         grid_resolution: ``(X, Y, Z)`` of the occupancy target.
         grid_extent: sizes of its grid, metres; the grid is centred on the mean of the cameras.
         targets: some of ``TARGETS``.
-        input_mask: whether the amodal mask is given as a fourth channel of the images.
+        object_choice: which annotated objects are the targets "objects" and "shapes": ``"all"`` of the scan;
+            ``"in_volume"``, those whose box centre lies in the voxel grid, after augmentation; or ``"seen"``,
+            those that a frame which is given sees (``seen_objects``). Other targets are always of all.
+        input_mask: mask of all objects that is given as a fourth channel of the images: None, ``"amodal"``
+            (``foreground_masks``), or ``"visible"`` (``visible_masks``, from a mesh in each scan's folder).
         min_views: fewest different frames of a scene.
         augmentation: random changes of each scene, for training; None for none.
         seed: of the random frames and of the augmentation.
@@ -97,12 +113,15 @@ class SceneDataset(Dataset[SceneBatch]):
         grid_resolution: tuple[int, int, int] = (48, 48, 16),
         grid_extent: tuple[float, float, float] = (9.0, 9.0, 3.5),
         targets: Collection[str] = TARGETS,
-        input_mask: bool = False,
+        object_choice: Literal["all", "in_volume", "seen"] = "all",
+        input_mask: Literal["amodal", "visible"] | None = None,
         min_views: int = MIN_VIEWS,
         augmentation: Augmentation | None = None,
         seed: int = 0,
     ) -> None:
-        _check(targets, view_choice, annotations, shapenet_root, input_mask)
+        _check(targets, annotations, shapenet_root, input_mask=input_mask, object_choice=object_choice)
+        if view_choice not in ("random", "even"):
+            raise ConfigError(f"unknown view_choice {view_choice!r}: choose random or even")
         if isinstance(annotations, str | Path):
             annotations = read_annotations(Path(annotations))
         self.scene_ids = choose_scenes(Path(scans_root), scene_ids, annotations)
@@ -117,6 +136,7 @@ class SceneDataset(Dataset[SceneBatch]):
         self._view_choice = view_choice
         self._grid_resolution, self._grid_extent = grid_resolution, grid_extent
         self._targets = frozenset(targets)
+        self._object_choice = object_choice
         self._input_mask = input_mask
         self._augmentation = augmentation
         self._seed = seed
@@ -145,6 +165,7 @@ class SceneDataset(Dataset[SceneBatch]):
         )
         seen, rendered = self._hold_out(used, randomness)
         scene = self._scene(scan, views, used, seen, self._with_shapes(self._objects_of[index]))
+        shown = self._shown(scene, seen)
         if self._augmentation is not None:
             scene = self._augmentation(scene, randomness.generator(_AUGMENTATION))
         if rendered:
@@ -153,7 +174,9 @@ class SceneDataset(Dataset[SceneBatch]):
         wanted = self._targets & {"objects", "shapes"}
         return replace(
             scene,
-            objects=tuple(self._without_unasked(part) for part in objects) if wanted else None,
+            objects=tuple(self._wanted(part, shown, scene.grid_center) for part in objects)
+            if wanted
+            else None,
             occupancy=self._occupancy(objects[0], scene.grid_center[0]) if objects else None,
             foreground=scene.foreground if "foreground" in self._targets else None,
         )
@@ -164,9 +187,10 @@ class SceneDataset(Dataset[SceneBatch]):
         """Return a scene as it is on disk, with masks if they are wanted."""
         cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], self._image_size)
         foreground = self._foreground(objects, cameras)
-        if self._input_mask and foreground is not None:
-            mask = foreground[:, :, None].byte() * 255
-            views = replace(views, images=torch.cat([views.images, mask], dim=2))
+        mask = self._visible(objects, cameras, scan) if self._input_mask == "visible" else foreground
+        if self._input_mask is not None and mask is not None:
+            channel = mask[:, :, None].byte() * 255
+            views = replace(views, images=torch.cat([views.images, channel], dim=2))
         return SceneBatch(
             scene_id=(scan.scene_id,),
             views=views,
@@ -198,8 +222,24 @@ class SceneDataset(Dataset[SceneBatch]):
         shapes = shape_grids(objects.model_id, shapenet_root=self._shapenet_root, cache=self._cache)
         return replace(objects, shape=shapes)
 
-    def _without_unasked(self, objects: ObjectSet) -> ObjectSet:
-        return objects if "shapes" in self._targets else replace(objects, shape=None)
+    def _wanted(self, objects: ObjectSet, shown: Tensor | None, grid_center: Tensor) -> ObjectSet:
+        """Return the objects that are targets, with shapes if these are."""
+        if "shapes" not in self._targets:
+            objects = replace(objects, shape=None)
+        if self._object_choice == "in_volume":
+            half = torch.tensor(self._grid_extent, dtype=torch.float64) / 2
+            shown = ((objects.center - grid_center).double().abs() <= half).all(dim=1)
+        return objects if shown is None else objects.select(shown)
+
+    def _shown(self, scene: SceneBatch, seen: Sequence[int]) -> Tensor | None:
+        """Return which objects the frames at ``seen`` see, ``(M,)`` bool; None if that is not asked for."""
+        wanted = self._object_choice == "seen" and self._targets & {"objects", "shapes"}
+        if not wanted or self._shapenet_root is None or scene.objects is None:
+            return None
+        views = _some(scene.views, seen)
+        cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], self._image_size)
+        (objects,), root = scene.objects, self._shapenet_root
+        return seen_objects(objects, cameras, shapenet_root=root, cache=self._cache).any(dim=0)
 
     def _occupancy(self, objects: ObjectSet, grid_center: Tensor) -> Tensor | None:
         if "occupancy" not in self._targets:
@@ -208,9 +248,19 @@ class SceneDataset(Dataset[SceneBatch]):
         return scene_occupancy(objects, grid)[None]
 
     def _foreground(self, objects: ObjectSet, cameras: Cameras) -> Tensor | None:
-        if self._shapenet_root is None or not (self._input_mask or "foreground" in self._targets):
+        wanted = self._input_mask == "amodal" or "foreground" in self._targets
+        if self._shapenet_root is None or not wanted:
             return None
         return foreground_masks(objects, cameras, shapenet_root=self._shapenet_root, cache=self._cache)[None]
+
+    def _visible(self, objects: ObjectSet, cameras: Cameras, scan: Scan) -> Tensor | None:
+        if self._shapenet_root is None:
+            return None
+        paths = {
+            "scan_mesh": scan.folder / SCAN_MESH.format(scan.scene_id),
+            "shapenet_root": self._shapenet_root,
+        }
+        return visible_masks(objects, cameras, **paths, cache=self._cache)[None]
 
 
 def scan2cad_dataset(root: Path, split: str, *, cache_dir: Path, **options: Any) -> SceneDataset:
@@ -234,7 +284,7 @@ def scan2cad_dataset(root: Path, split: str, *, cache_dir: Path, **options: Any)
             f"there is no folder {root / 'scannet' / 'scans'}: prepare the data set or mend its path"
         )
     listed = read_split(root / "scannet", split)
-    path = root / "scan2cad" / "full_annotations.json"
+    path = annotation_path(root)
     annotations = read_annotations(path)
     having = set(annotated(annotations))
     if not having:
@@ -257,20 +307,27 @@ def scan2cad_dataset(root: Path, split: str, *, cache_dir: Path, **options: Any)
 
 def _check(
     targets: Collection[str],
-    view_choice: str,
     annotations: object,
     shapenet_root: Path | None,
-    mask: bool,
+    *,
+    input_mask: object,
+    object_choice: str,
 ) -> None:
     unknown = set(targets) - set(TARGETS)
     if unknown:
         raise ConfigError(f"unknown targets {sorted(unknown)}: choose from {', '.join(TARGETS)}")
-    if view_choice not in ("random", "even"):
-        raise ConfigError(f"unknown view_choice {view_choice!r}: choose random or even")
+    if object_choice not in OBJECT_CHOICES:
+        choices = ", ".join(OBJECT_CHOICES)
+        raise ConfigError(f"unknown object_choice={object_choice}: choose one of {choices}")
+    if input_mask not in (None, *INPUT_MASKS):
+        raise ConfigError(f"unknown input_mask={input_mask}: choose one of {', '.join(INPUT_MASKS)}, null")
+    mask = input_mask is not None
     if (targets or mask) and annotations is None:
         raise ConfigError("targets and input masks need annotations: give the path of full_annotations.json")
-    if (set(targets) - {"objects"} or mask) and shapenet_root is None:
-        raise ConfigError("shapes, occupancy and masks need CAD models: give shapenet_root")
+    if (set(targets) - {"objects"} or mask or object_choice == "seen") and shapenet_root is None:
+        raise ConfigError(
+            "shapes, occupancy, masks and the choice of seen objects need CAD models: give shapenet_root"
+        )
 
 
 def _divided(scene: SceneBatch, seen: Sequence[int], rendered: Sequence[int]) -> SceneBatch:

@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from raytran.data.cache import file_digest
 from raytran.errors import DataError
 from raytran.geometry.rotation import matrix_from_quaternion, quaternion_from_matrix
 from raytran.types import CLASS_BY_CATID, CLASSES, SYMMETRY_INFINITE, CadAlignments, ObjectSet
@@ -54,6 +55,17 @@ class SceneAnnotation:
     box_half_size: Tensor
     symmetry: Tensor
     scale: Tensor
+
+
+def annotation_path(root: Path) -> Path:
+    """Return where a data set laid out as ``root/{scannet,scan2cad,shapenet}`` has its annotation."""
+    return Path(root) / "scan2cad" / "full_annotations.json"
+
+
+def annotation_digest(root: Path) -> str | None:
+    """Return a digest of a data set's annotation, which tells it from others; None if it has none."""
+    path = annotation_path(root)
+    return file_digest(path) if path.is_file() else None
 
 
 def read_annotations(path: Path) -> dict[str, SceneAnnotation]:

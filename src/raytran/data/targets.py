@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import torch
+import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -17,11 +19,15 @@ from raytran.data.voxelize import voxelize_solid
 from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.ops.rasterize import rasterize_mask
+from raytran.ops.rasterize import rasterize_ids, rasterize_mask, rasterize_visible
 from raytran.types import SHAPE_SIZE, ObjectSet
 
 _MAX_POINTS = 1 << 25
 """Most points that may fill one object's box; with more it is far larger than any room."""
+
+STANDS_OFF = 0.2
+"""Depth by which the scan's surface may be nearer than a CAD model that stands for it, metres: as far as a
+model may be off in Scan2CAD's benchmark."""
 
 _VERSION = 1
 """Part of every key; raise it when the way a target is computed changes."""
@@ -105,21 +111,126 @@ def foreground_masks(
     Raises:
         DataError: a CAD file is missing or cannot be read.
     """
+
+    def draw(missing: Cameras) -> NDArray[np.bool_]:
+        return rasterize_mask(object_meshes(objects, shapenet_root=shapenet_root), missing).numpy()
+
+    key = _scene_key(objects, shapenet_root)
+    return _of_each_camera("foreground", key, cameras, cameras.image_size, cache, draw)
+
+
+def visible_masks(
+    objects: ObjectSet, cameras: Cameras, *, scan_mesh: Path, shapenet_root: Path, cache: MaskCache
+) -> Tensor:
+    """Return the pixels on which an object is seen: the amodal mask without what the scan's surface hides.
+
+    Objects hide only pixels of each other, which stay in the mask of all of them. What else is in the room is
+    known from the scan's own mesh, which holds the real surfaces of the objects too: a pixel is hidden where
+    that is nearer than the CAD model by more than ``STANDS_OFF``.
+
+    Args:
+        objects: M objects with model names.
+        cameras: of N images of ``H × W``, leading dimensions ``(N,)``.
+        scan_mesh: the scan's mesh in the world of its poses, ScanNet's ``<scan>_vh_clean_2.ply``.
+        shapenet_root: folder of the categories.
+        cache: keeps each mask under the objects' boxes, the content of all mesh files and the camera.
+
+    Returns:
+        ``(N, H, W)`` bool.
+
+    Raises:
+        DataError: a mesh is missing or cannot be read.
+    """
+    if not scan_mesh.is_file():
+        raise DataError(
+            f"there is no mesh {scan_mesh}, which tells what hides objects: copy it from ScanNet's release, "
+            "or set data.dataset.input_mask=amodal"
+        )
+
+    content = file_digest(scan_mesh)
+
+    def draw(missing: Cameras) -> NDArray[np.bool_]:
+        meshes = object_meshes(objects, shapenet_root=shapenet_root)
+        scan = _scan_surface(scan_mesh, content)
+        return rasterize_visible(meshes, [scan], missing, tolerance=STANDS_OFF).numpy()
+
+    key = digest(STANDS_OFF, content, _scene_key(objects, shapenet_root))
+    return _of_each_camera("visible", key, cameras, cameras.image_size, cache, draw)
+
+
+def seen_objects(objects: ObjectSet, cameras: Cameras, *, shapenet_root: Path, cache: MaskCache) -> Tensor:
+    """Return which objects each view sees: those that are the nearest object in one of its pixels at least.
+
+    Objects hide each other, by the surfaces of their CAD models at the centres of the pixels; nothing else
+    does, neither walls nor furniture that is not annotated.
+
+    Args:
+        objects: M objects with model names.
+        cameras: of N images of ``H × W``, leading dimensions ``(N,)``.
+        shapenet_root: folder of the categories.
+        cache: keeps the result of each view as ``foreground_masks`` does.
+
+    Returns:
+        ``(N, M)`` bool.
+
+    Raises:
+        DataError: a CAD file is missing or cannot be read.
+    """
+
+    def draw(missing: Cameras) -> NDArray[np.bool_]:
+        ids, _ = rasterize_ids(object_meshes(objects, shapenet_root=shapenet_root), missing)
+        seen = np.zeros((len(ids), len(objects)), dtype=bool)
+        for of_view, nearest in zip(seen, ids.numpy(), strict=True):
+            of_view[np.unique(nearest[nearest >= 0])] = True
+        return seen
+
+    key = _scene_key(objects, shapenet_root)
+    return _of_each_camera("seen", key, cameras, (len(objects),), cache, draw)
+
+
+def _scene_key(objects: ObjectSet, shapenet_root: Path) -> str:
+    """Return a digest of the objects' boxes and of the content of their CAD files."""
     contents = [_content(shapenet_root, model_id) for model_id in objects.model_id]
-    scene = digest(_VERSION, contents, *(t.numpy() for t in (objects.center, objects.size, objects.rotation)))
+    return digest(_VERSION, contents, *(t.numpy() for t in (objects.center, objects.size, objects.rotation)))
+
+
+def _of_each_camera(
+    kind: str,
+    scene_key: str,
+    cameras: Cameras,
+    shape: tuple[int, ...],
+    cache: MaskCache,
+    draw: Callable[[Cameras], NDArray[np.bool_]],
+) -> Tensor:
+    """Return an array of each of N cameras from the cache, ``(N, *shape)``; draw those that it lacks."""
     intrinsics, world_from_camera = cameras.intrinsics.numpy(), cameras.world_from_camera.numpy()
     keys = [
-        digest(scene, cameras.image_size, *camera)
+        digest(scene_key, cameras.image_size, *camera)
         for camera in zip(intrinsics, world_from_camera, strict=True)
     ]
-    masks, missing = cache.read_stack("foreground", keys, cameras.image_size)
+    arrays, missing = cache.read_stack(kind, keys, shape)
     if missing:
-        meshes = object_meshes(objects, shapenet_root=shapenet_root)
         chosen = Cameras(cameras.intrinsics[missing], cameras.world_from_camera[missing], cameras.image_size)
-        masks[missing] = rasterize_mask(meshes, chosen).numpy()
+        arrays[missing] = draw(chosen)
         for i in missing:
-            cache.write("foreground", keys[i], masks[i])
-    return torch.from_numpy(masks)
+            cache.write(kind, keys[i], arrays[i])
+    return torch.from_numpy(arrays)
+
+
+@lru_cache(maxsize=2)
+def _scan_surface(path: Path, _content: str) -> tuple[NDArray, NDArray]:
+    """Return vertices ``(V, 3)`` and faces ``(F, 3)`` of a scan's mesh, in the world of its poses.
+
+    Raises:
+        DataError: it cannot be read.
+    """
+    try:
+        mesh = trimesh.load(path, process=False)
+    except Exception as error:  # a damaged file can fail anywhere in trimesh
+        raise DataError(f"cannot read the mesh {path} ({error}): copy it again") from error
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise DataError(f"{path} holds no triangles: copy the scan's mesh again")
+    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
 def object_meshes(objects: ObjectSet, *, shapenet_root: Path) -> list[tuple[NDArray, NDArray]]:

@@ -3,10 +3,15 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+
+from raytran.types import SceneBatch
+
+_log = logging.getLogger(__name__)
 
 
 def choose_random(n: int, count: int, generator: torch.Generator) -> Tensor:
@@ -63,3 +68,23 @@ def hold_out(
     seen = [place for place, frame in enumerate(used) if frame not in rendered]
     seen = [seen[i] for i in choose_even(len(seen), len(used) - count).tolist()]
     return seen, [used.index(frame) for frame in rendered]
+
+
+class RepeatedFrames:
+    """Says once if scans have fewer frames than are asked for, so that some of them come more than once.
+
+    A frame that comes twice weighs twice, and results with "96 frames" are then of fewer.
+    """
+
+    def __init__(self) -> None:
+        self._is_said = False
+
+    def look(self, batch: SceneBatch) -> None:
+        """Look at the frames of another batch; held-out ones are not among them."""
+        for scene_id, frames in zip(batch.scene_id, batch.frame_id, strict=True):
+            if not self._is_said and len(set(frames)) < len(frames):
+                self._is_said = True
+                _log.warning(
+                    "scans have %d frames, fewer than the %d asked for: frames are repeated (in %s first)",
+                    *(len(set(frames)), len(frames), scene_id),
+                )

@@ -11,10 +11,13 @@ from torch import Tensor
 from raytran.heads.denoising import copied_objects
 from raytran.losses.matcher import Match
 from raytran.losses.objects import object_losses
+from raytran.losses.pose import Betas
 from raytran.types import ObjectSet, RawObjects
 
 
-def denoising_losses(layers: Sequence[RawObjects], targets: Sequence[ObjectSet]) -> dict[str, Tensor]:
+def denoising_losses(
+    layers: Sequence[RawObjects], targets: Sequence[ObjectSet], *, betas: Betas
+) -> dict[str, Tensor]:
     """Return the class and pose losses of the copies, means over slots, sums over decoder layers.
 
     A scene without objects has slots that are copies of nothing: they count as slots without a loss.
@@ -22,6 +25,7 @@ def denoising_losses(layers: Sequence[RawObjects], targets: Sequence[ObjectSet])
     Args:
         layers: predictions ``(B, D, ...)`` of every layer.
         targets: true objects of B scenes.
+        betas: of the poses' smooth L1.
 
     Returns:
         ``class``, ``center``, ``size`` and ``yaw``, scalars.
@@ -39,7 +43,13 @@ def denoising_losses(layers: Sequence[RawObjects], targets: Sequence[ObjectSet])
     totals: dict[str, Tensor] = {}
     for layer in layers:
         found = object_losses(
-            layer, copied, matches, num_objects=slots_in_all, class_weight=slots_in_all, no_object_weight=0.0
+            layer,
+            copied,
+            matches,
+            num_objects=slots_in_all,
+            class_weight=slots_in_all,
+            no_object_weight=0.0,
+            betas=betas,
         )
         totals = {name: totals.get(name, 0.0) + value for name, value in found.items()}
     return totals

@@ -4,17 +4,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor, nn
 
-from raytran.losses.pose import pose_errors
+from raytran.errors import ConfigError
+from raytran.losses.pose import Betas, pose_errors
 from raytran.types import ObjectSet, RawObjects
 
 UNUSABLE = 1e6
 """Cost in place of one that is not finite, as 16-bit training meets in steps that its scaler then skips."""
+
+
+CLASS_COSTS = ("probability", "cross_entropy")
 
 
 class Match(NamedTuple):
@@ -32,16 +36,32 @@ class Match(NamedTuple):
 class HungarianMatcher(nn.Module):
     """Finds the assignment with the least sum of all loss terms but the shape (RayTran §3.2).
 
-    As in DETR, the class costs minus its probability instead of the cross entropy, which is unbounded and
-    would outweigh the pose of a slot that is sure of a wrong class.
-
     Args:
         weights: ``class``, ``center``, ``size`` and ``yaw``; other names are ignored, so that the weights of
             the loss can be given.
+        class_cost: what an object's class costs a slot that gives it the probability p. ``probability``: −p,
+            as in DETR; ``cross_entropy``: −log p, the loss itself as the paper has it, which is unbounded and
+            outweighs the pose of a slot that is sure of a wrong class.
+        center_beta: of the centre's smooth L1, see ``Betas``.
+        yaw_beta: of the yaw's.
+
+    Raises:
+        ConfigError: there is no such ``class_cost``, or a beta is negative.
     """
 
-    def __init__(self, *, weights: Mapping[str, float]) -> None:
+    def __init__(
+        self,
+        *,
+        weights: Mapping[str, float],
+        class_cost: Literal["probability", "cross_entropy"] = "probability",
+        center_beta: float = Betas().center,
+        yaw_beta: float = Betas().yaw,
+    ) -> None:
         super().__init__()
+        if class_cost not in CLASS_COSTS:
+            raise ConfigError(f"unknown class_cost={class_cost}: choose one of {', '.join(CLASS_COSTS)}")
+        self.class_cost = class_cost
+        self.betas = Betas(center_beta, yaw_beta).checked()
         self.weights = {name: float(weights[name]) for name in ("class", "center", "size", "yaw")}
 
     @torch.no_grad()
@@ -56,10 +76,19 @@ class HungarianMatcher(nn.Module):
 
     def cost(self, raw: RawObjects, scene: int, objects: ObjectSet) -> Tensor:
         """Return the cost ``(Q, M)`` of every slot of ``scene`` with every true object."""
-        probability = raw.class_logits[scene].float().softmax(dim=-1)
         errors = pose_errors(
-            raw.center[scene, :, None], raw.log_size[scene, :, None], raw.yaw_vector[scene, :, None], objects
+            raw.center[scene, :, None],
+            raw.log_size[scene, :, None],
+            raw.yaw_vector[scene, :, None],
+            objects,
+            self.betas,
         )
-        terms = {"class": -probability[:, objects.label], **errors}
+        terms = {"class": self._class_cost(raw.class_logits[scene].float())[:, objects.label], **errors}
         cost = torch.stack([self.weights[name] * term for name, term in terms.items()]).sum(dim=0)
         return torch.nan_to_num(cost, nan=UNUSABLE, posinf=UNUSABLE, neginf=UNUSABLE)
+
+    def _class_cost(self, logits: Tensor) -> Tensor:
+        """Return what each class costs each slot, ``(Q, K + 1)`` as the logits."""
+        if self.class_cost == "cross_entropy":
+            return -logits.log_softmax(dim=-1)
+        return -logits.softmax(dim=-1)

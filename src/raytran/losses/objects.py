@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from raytran.losses.matcher import Match
-from raytran.losses.pose import pose_errors
+from raytran.losses.pose import Betas, pose_errors
 from raytran.types import PADDING, ObjectSet, RawObjects
 
 
@@ -22,6 +22,7 @@ def object_losses(
     num_objects: Tensor,
     class_weight: Tensor,
     no_object_weight: float,
+    betas: Betas,
 ) -> dict[str, Tensor]:
     """Return the class and pose losses of one decoder layer.
 
@@ -33,6 +34,7 @@ def object_losses(
         class_weight: scalar by which the cross entropies' weighted sum over slots is divided; the sum of the
             weights gives their mean.
         no_object_weight: weight of the padding class in the cross entropy.
+        betas: of the poses' smooth L1.
 
     Returns:
         ``class``, ``center``, ``size`` and ``yaw``, scalars; zero pose losses without objects.
@@ -46,6 +48,7 @@ def object_losses(
             raw.log_size[scene, match.slot],
             raw.yaw_vector[scene, match.slot],
             objects.select(match.target),
+            betas,
         )
         for name, error in errors.items():
             losses[name] = losses[name] + error.sum() / num_objects

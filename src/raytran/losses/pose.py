@@ -3,21 +3,44 @@
 
 from __future__ import annotations
 
+import math
+from typing import NamedTuple
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from raytran.errors import ConfigError
 from raytran.geometry.rotation import symmetric_yaw_error, yaw_from_rotation
 from raytran.types import ObjectSet
 
-CENTER_BETA = 0.1
-"""Error in metres at which the smooth L1 of the centre turns from a square to a line."""
 
-YAW_BETA = 0.1
-"""The same for the yaw, radians."""
+class Betas(NamedTuple):
+    """Errors at which smooth L1 turns from a square to a line; 0 makes it a line throughout.
+
+    Attributes:
+        center: along each axis, metres.
+        yaw: radians.
+    """
+
+    center: float = 0.1
+    yaw: float = 0.1
+
+    def checked(self) -> Betas:
+        """Return them as numbers.
+
+        Raises:
+            ConfigError: one is negative or not finite.
+        """
+        for name, beta in self._asdict().items():
+            if not 0 <= beta < math.inf:
+                raise ConfigError(f"{name}_beta={beta}: give a length or an angle, at least 0")
+        return Betas(float(self.center), float(self.yaw))
 
 
-def pose_errors(center: Tensor, log_size: Tensor, yaw_vector: Tensor, target: ObjectSet) -> dict[str, Tensor]:
+def pose_errors(
+    center: Tensor, log_size: Tensor, yaw_vector: Tensor, target: ObjectSet, betas: Betas
+) -> dict[str, Tensor]:
     """Return the pose losses of predictions against true objects, not reduced over objects.
 
     Smooth L1 of the centre and L1 of the logarithm of the size, each summed over the three axes, and smooth
@@ -28,6 +51,7 @@ def pose_errors(center: Tensor, log_size: Tensor, yaw_vector: Tensor, target: Ob
         log_size: ``(..., M or 1, 3)``.
         yaw_vector: ``(..., M or 1, 2)`` (sin, cos), of any length.
         target: M true objects.
+        betas: of smooth L1.
 
     Returns:
         ``center``, ``size`` and ``yaw``, each ``(..., M)``.
@@ -35,9 +59,9 @@ def pose_errors(center: Tensor, log_size: Tensor, yaw_vector: Tensor, target: Ob
     yaw = yaw_from_vector(yaw_vector)
     yaw_error = symmetric_yaw_error(yaw, yaw_from_rotation(target.rotation), target.symmetry)
     return {
-        "center": _smooth_l1(center - target.center, CENTER_BETA).sum(dim=-1),
+        "center": _smooth_l1(center - target.center, betas.center).sum(dim=-1),
         "size": (log_size - target.size.log()).abs().sum(dim=-1),
-        "yaw": _smooth_l1(yaw_error, YAW_BETA),
+        "yaw": _smooth_l1(yaw_error, betas.yaw),
     }
 
 

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from raytran.losses.pose import pose_errors
+from raytran.losses.pose import Betas, pose_errors
 from raytran.types import ObjectSet, RawProposals
 
 SPREAD = 0.7
@@ -20,7 +20,7 @@ LEAST_HEAT = 0.3
 
 
 def proposal_losses(
-    proposals: RawProposals, targets: Sequence[ObjectSet], *, num_objects: Tensor
+    proposals: RawProposals, targets: Sequence[ObjectSet], *, num_objects: Tensor, betas: Betas
 ) -> dict[str, Tensor]:
     """Return the losses of the proposals of B scenes.
 
@@ -32,6 +32,7 @@ def proposal_losses(
         proposals: of all voxels.
         targets: true objects.
         num_objects: scalar by which the sums are divided.
+        betas: of the poses' smooth L1.
 
     Returns:
         ``heat``, ``center``, ``size`` and ``yaw``, scalars.
@@ -50,7 +51,7 @@ def proposal_losses(
         totals["heat"] = totals["heat"] + _focal_loss(logits, target) / num_objects
         which, voxel = (heat > LEAST_HEAT).nonzero(as_tuple=True)
         weight = heat[which, voxel] / torch.where(heat > LEAST_HEAT, heat, 0.0).sum(dim=1)[which]
-        errors = pose_errors(center[voxel], log_size[voxel], yaw_vector[voxel], objects.select(which))
+        errors = pose_errors(center[voxel], log_size[voxel], yaw_vector[voxel], objects.select(which), betas)
         for name, error in errors.items():
             totals[name] = totals[name] + (weight * error).sum() / num_objects
     return totals

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import fields, replace
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -16,6 +16,7 @@ from raytran.losses.foreground import foreground_loss
 from raytran.losses.matcher import HungarianMatcher, Match
 from raytran.losses.objects import object_losses
 from raytran.losses.occupancy import occupancy_loss
+from raytran.losses.pose import Betas
 from raytran.losses.proposals import proposal_losses
 from raytran.losses.shape import shape_loss
 from raytran.losses.view import view_loss
@@ -23,6 +24,7 @@ from raytran.types import ObjectSet, RawObjects, RawScene, SceneBatch
 
 WEIGHTS = ("occupancy", "foreground", "class", "center", "size", "yaw", "heat", "shape", "view")
 TERMS = ("occupancy", "foreground", "objects", "shape", "view")
+SHAPE_LAYERS = ("last", "all")
 
 _T = TypeVar("_T")
 _U = TypeVar("_U")
@@ -35,20 +37,35 @@ class TotalLoss(nn.Module):
         weights: one weight per name in ``WEIGHTS``; all decoder layers count alike.
         matcher: matches slots with true objects.
         no_object_weight: weight of the padding class in the cross entropy (0.1 in DETR).
+        shape_layers: which decoder layers tell the shapes of their matched slots: the ``last``, or ``all``,
+            each with its own matches and all alike, as class and pose; that decodes as many times the grids.
+        center_beta: of the centre's smooth L1, see ``Betas``.
+        yaw_beta: of the yaw's.
 
     Raises:
-        ConfigError: a weight is missing or unknown.
+        ConfigError: a weight is missing or unknown, there is no such choice, or a beta is negative.
     """
 
     def __init__(
-        self, *, weights: Mapping[str, float], matcher: HungarianMatcher, no_object_weight: float = 0.1
+        self,
+        *,
+        weights: Mapping[str, float],
+        matcher: HungarianMatcher,
+        no_object_weight: float = 0.1,
+        shape_layers: Literal["last", "all"] = "last",
+        center_beta: float = Betas().center,
+        yaw_beta: float = Betas().yaw,
     ) -> None:
         super().__init__()
+        if shape_layers not in SHAPE_LAYERS:
+            raise ConfigError(f"unknown shape_layers={shape_layers}: choose one of {', '.join(SHAPE_LAYERS)}")
         if set(weights) != set(WEIGHTS):
             raise ConfigError(f"expected loss weights {sorted(WEIGHTS)}, got {sorted(weights)}")
         self.weights = {name: float(weights[name]) for name in WEIGHTS}
         self.matcher = matcher
         self.no_object_weight = no_object_weight
+        self.shape_layers = shape_layers
+        self.betas = Betas(center_beta, yaw_beta).checked()
 
     def forward(
         self,
@@ -75,7 +92,8 @@ class TotalLoss(nn.Module):
         Returns:
             ``occupancy``, ``foreground``, ``shape``, ``view``; ``objects/class``, ``objects/center``,
             ``objects/size``, ``objects/yaw`` of the last decoder layer, ``objects/class/layer0`` … of earlier
-            ones, ``objects/heat/proposals`` … and ``objects/class/copies`` … if the network makes any.
+            ones, ``objects/heat/proposals`` … and ``objects/class/copies`` … if the network makes any, and
+            ``shape/layer0`` … of earlier layers if all tell shapes.
 
         Raises:
             ConfigError: a term is unknown, or the network was not asked for it.
@@ -118,9 +136,15 @@ class TotalLoss(nn.Module):
             if decode_shapes is None:
                 raise ConfigError("the loss term shape needs decode_shapes: give RayTran.decode_shapes")
             losses["shape"] = _matched_shape_loss(layers[-1], targets, last, decode_shapes, num_objects)
-        for index, layer in enumerate(layers if "objects" in terms else ()):
+        earlier_shapes = "shape" in terms and self.shape_layers == "all"
+        for index, layer in enumerate(layers if "objects" in terms or earlier_shapes else ()):
             is_last = index + 1 == len(layers)
             matches = last if is_last else self.matcher(layer, targets)
+            if earlier_shapes and decode_shapes is not None and not is_last:
+                value = _matched_shape_loss(layer, targets, matches, decode_shapes, num_objects)
+                losses[f"shape/layer{index}"] = value
+            if "objects" not in terms:
+                continue
             found = object_losses(
                 layer,
                 targets,
@@ -128,14 +152,16 @@ class TotalLoss(nn.Module):
                 num_objects=num_objects,
                 class_weight=class_weight,
                 no_object_weight=self.no_object_weight,
+                betas=self.betas,
             )
             suffix = "" if is_last else f"/layer{index}"
             losses |= {f"objects/{name}{suffix}": value for name, value in found.items()}
         if "objects" in terms and raw.proposals is not None:
-            found = proposal_losses(raw.proposals, targets, num_objects=num_objects)
+            found = proposal_losses(raw.proposals, targets, num_objects=num_objects, betas=self.betas)
             losses |= {f"objects/{name}/proposals": value for name, value in found.items()}
         if "objects" in terms and raw.copies is not None:
-            found = denoising_losses([_in_float32(layer) for layer in raw.copies], targets)
+            copies = [_in_float32(layer) for layer in raw.copies]
+            found = denoising_losses(copies, targets, betas=self.betas)
             losses |= {f"objects/{name}/copies": value for name, value in found.items()}
         return losses
 

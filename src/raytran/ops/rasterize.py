@@ -75,6 +75,37 @@ def rasterize_ids(meshes: Sequence[Mesh], cameras: Cameras) -> tuple[Tensor, Ten
     return ids, depths
 
 
+def rasterize_visible(
+    meshes: Sequence[Mesh], occluders: Sequence[Mesh], cameras: Cameras, *, tolerance: float
+) -> Tensor:
+    """Return the pixels whose centre ray meets any of the meshes and, before it, none of the occluders.
+
+    Which of the meshes is in front does not matter for all of them together: so the meshes of all objects
+    hide none of their own pixels, only what is no object does.
+
+    Args:
+        meshes: triangle meshes in the world.
+        occluders: triangle meshes that may be in front, e.g. of a whole scan, surfaces of objects included.
+        cameras: of N images of ``H × W``, leading dimensions ``(N,)``.
+        tolerance: depth by which an occluder must be nearer to hide a mesh, metres.
+
+    Returns:
+        ``(N, H, W)`` bool, part of ``rasterize_mask``.
+
+    Raises:
+        ShapeError: the cameras' tensors are not ``(N, ...)``.
+    """
+    _, depth = rasterize_ids(meshes, cameras)
+    visible = depth < torch.inf
+    caster = _Caster(occluders)
+    for mask, distance, camera in zip(visible, depth, _each(cameras), strict=True):
+        # Only where there is a mesh to be hidden.
+        hit = caster.cast(camera, mask, output=True)
+        nearest = torch.from_numpy(hit["tfar"]).where(torch.from_numpy(hit["primID"] != -1), torch.inf)
+        mask[mask.clone()] = nearest >= distance[mask] - tolerance
+    return visible
+
+
 class _Caster:
     """Meshes prepared for ray casting, each with the box around it."""
 

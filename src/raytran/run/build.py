@@ -17,9 +17,11 @@ from raytran.run.folders import LAST
 from raytran.run.loggers import METRICS
 from raytran.run.settings import RunConfig
 from raytran.run.watch import watching_callbacks
+from raytran.run.weights import without_sources
 from raytran.training.callbacks.effective_batch import EffectiveBatch
 from raytran.training.callbacks.last_checkpoint import LastCheckpoint
 from raytran.training.callbacks.rank_agreement import RankAgreement
+from raytran.training.callbacks.repeated_frames import RepeatedFramesWarning
 from raytran.training.callbacks.stage_setup import StageSetup
 from raytran.training.callbacks.step_progress import StepProgress
 from raytran.training.checkpoint_io import AtomicCheckpointIO
@@ -47,9 +49,7 @@ def build_model(cfg: DictConfig, *, pretrained: bool = True) -> RayTran:
         pretrained: False leaves out the image encoder's own weights, because a checkpoint will fill it.
     """
     config = plain(cfg.model)
-    if not pretrained:
-        config["backbone"]["resnet"]["weights"] = None
-    return instantiate(config, _convert_="all")
+    return instantiate(config if pretrained else without_sources(config), _convert_="all")
 
 
 def build_module(cfg: DictConfig, model: RayTran) -> Reconstruction:
@@ -102,6 +102,7 @@ def build_trainer(cfg: DictConfig, run: RunConfig, card: dict[str, Any]) -> pl.T
         StageSetup(),
         EffectiveBatch(per_device=cfg.data.batch_size, expected=cfg.schedule.batch),
         RankAgreement(),
+        RepeatedFramesWarning(),
         LastCheckpoint(folder / LAST, every_n_steps=run.checkpoint_every, card=card),
         *watching_callbacks(cfg, run, card),
     ]

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -14,6 +14,7 @@ import torch
 from raytran.errors import CheckpointError
 from raytran.ops.fused import Attention
 from raytran.ops.ray_tracer import RayTracer
+from raytran.run.known_data import KnownData
 from raytran.run.weights import checkpoint_path
 from raytran.training.checkpoint_content import FORMAT
 from raytran.training.checkpoint_file import read_checkpoint
@@ -24,7 +25,12 @@ if TYPE_CHECKING:
 
 
 def checkpoint_card(
-    *, stage: str, preset: str, config: Mapping[str, Any], parent: Mapping[str, Any] | None
+    *,
+    stage: str,
+    preset: str,
+    config: Mapping[str, Any],
+    parent: Mapping[str, Any] | None,
+    warnings: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Return the plain Python that identifies a checkpoint.
 
@@ -33,7 +39,8 @@ def checkpoint_card(
         preset: name of the preset.
         config: all settings of the run, resolved; ``model`` rebuilds the network, ``views`` holds
             ``image_size`` [H, W], ``num_views`` in training and ``predict_views``.
-        parent: the checkpoint that the fit started from (``path``, ``stage``, ``step``, ``scores``), or None.
+        parent: the checkpoint that the fit started from, see ``Parent``, or None.
+        warnings: what anybody who uses the weights should know.
     """
     from raytran.run.provenance import git_commit, versions
 
@@ -44,25 +51,39 @@ def checkpoint_card(
         "model": copy.deepcopy(config["model"]),
         "views": copy.deepcopy(config["views"]),
         "config": copy.deepcopy(dict(config)),
+        "data": KnownData.of_config(config).as_plain(),
+        "input_mask": _input_mask(config),
         "parent": None if parent is None else dict(parent),
+        "warnings": list(warnings),
         "git_commit": git_commit(),
         "versions": versions(),
     }
 
 
-def load_model(checkpoint: str | Path, *, attention: Attention = "auto") -> RayTran:
+def _input_mask(config: Any) -> str | None:
+    """Return the mask that goes in as a fourth channel; checkpoints from before there were two say True."""
+    for name in ("data", "dataset", "input_mask"):
+        config = config.get(name) if isinstance(config, Mapping) else None
+    return "amodal" if config is True else config if isinstance(config, str) else None
+
+
+def load_model(
+    checkpoint: str | Path, *, attention: Attention = "auto", trust: Iterable[str] = ()
+) -> RayTran:
     """Return the model of a checkpoint, in evaluation mode, on the CPU.
 
     Args:
         checkpoint: path of the file, or ``default`` for the weights that the package carries.
         attention: as in ``RayTran``; what the network was trained with does not matter.
+        trust: packages of your own whose classes the file may name, see ``trusted_packages``.
 
     Raises:
-        CheckpointError: the file is missing, damaged, or its weights do not fit the model described in it.
-        ConfigError: there is no such attention.
+        CheckpointError: the file is missing, damaged, or its weights do not fit the model described in it; or
+            that names a class of a package that is not trusted.
+        ConfigError: there is no such attention, or ``trust`` is no list of packages.
     """
     path = checkpoint_path(checkpoint)
-    model = model_from(read_checkpoint(path), path)
+    model = model_from(read_checkpoint(path), path, trust=trust)
     model.ray_tracer = RayTracer(attention)
     return model
 
@@ -76,12 +97,14 @@ class PredictionSettings:
         stage: name of the stage.
         image_size: ``(H, W)``.
         num_views: frames to predict from (96 in the paper).
+        input_mask: mask that goes in as a fourth channel, see ``SceneDataset``; None if that is not known.
     """
 
     preset: str
     stage: str
     image_size: tuple[int, int]
     num_views: int
+    input_mask: str | None = None
 
 
 def prediction_settings(checkpoint: str | Path) -> PredictionSettings:
@@ -101,24 +124,32 @@ def prediction_settings(checkpoint: str | Path) -> PredictionSettings:
         num_views = int(views["predict_views"])
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path} does not say which images its network wants: it is damaged") from error
-    return PredictionSettings(card["preset"], card["stage"], (height, width), num_views)
+    mask = card.get("input_mask") or _input_mask(card.get("config"))
+    return PredictionSettings(card["preset"], card["stage"], (height, width), num_views, mask)
 
 
-def model_from(checkpoint: Mapping[str, Any], path: Path) -> RayTran:
+def model_from(checkpoint: Mapping[str, Any], path: Path, *, trust: Iterable[str] = ()) -> RayTran:
     """Return the model of a checkpoint that was read from ``path`` already.
 
+    Args:
+        checkpoint: what ``read_checkpoint`` returned.
+        path: where from, for messages.
+        trust: packages of your own whose classes it may name, see ``trusted_packages``.
+
     Raises:
-        CheckpointError: the checkpoint describes no network of raytran, or its weights do not fit.
+        CheckpointError: the checkpoint describes no network of raytran or of a trusted package, or its
+            weights do not fit.
+        ConfigError: ``trust`` is no list of packages.
     """
     from raytran.model import RayTran
     from raytran.run.checkpoint_config import build_network
 
     with torch.device("meta"):  # the file's size, and not what it claims, decides how much memory is taken
-        shell = build_network(checkpoint["model"], path)
+        shell = build_network(checkpoint["model"], path, trust=trust)
     if not isinstance(shell, RayTran):
         raise CheckpointError(f"{path} describes only a part of a network: do not use this file")
     load_weights(shell, checkpoint, path, assign=True)
-    model = cast("RayTran", build_network(checkpoint["model"], path))
+    model = cast("RayTran", build_network(checkpoint["model"], path, trust=trust))
     load_weights(model, checkpoint, path)
     return model.eval()
 

@@ -5,78 +5,142 @@ from __future__ import annotations
 
 import importlib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from torch import nn
 
-from raytran.errors import CheckpointError
+from raytran.errors import CheckpointError, ConfigError
+
+_PACKAGE = "raytran"
 
 _MODULE = re.compile(r"raytran\.(model|backbone|heads)(\.[a-z_]+)*")
 """Where the parts of a network are defined."""
 
 _NOT_THE_NETWORK = ("attention", "freeze_norms")
-"""Settings beside those of the network: how it was computed there, and how older ones were trained."""
+"""Settings of ours that are not the network's: how it was computed there, and how older ones were trained."""
 
 _PLAIN = (str, int, float, bool, type(None))
 
 
-def build_network(config: Mapping[str, Any], source: object) -> nn.Module:
+def trusted_packages(trust: Any) -> tuple[str, ...]:
+    """Return the packages of the user's own whose classes a checkpoint may name, checked.
+
+    Args:
+        trust: a list of their names as the user gives it, never one out of a file; None for no package.
+
+    Raises:
+        ConfigError: it is no list, or holds something else than the name of a top-level package.
+    """
+    names = () if trust is None else trust
+    is_list = isinstance(names, Iterable) and not isinstance(names, str | Mapping)
+    if not is_list or any(not isinstance(name, str) or not name.isidentifier() for name in names):
+        raise ConfigError(f"trust={trust} is no list of top-level packages: write it as trust=[mylab]")
+    return tuple(names)
+
+
+def own_packages(config: Any) -> tuple[str, ...]:
+    """Return the top-level packages other than raytran whose classes ``config`` names, sorted."""
+    return tuple(sorted({str(target).partition(".")[0] for target in _targets(config)} - {_PACKAGE}))
+
+
+def _targets(node: Any) -> Iterator[Any]:
+    if isinstance(node, Mapping):
+        if "_target_" in node:
+            yield node["_target_"]
+        node = node.values()
+    elif not isinstance(node, list | tuple):
+        return
+    for value in node:
+        yield from _targets(value)
+
+
+def build_network(config: Mapping[str, Any], source: object, *, trust: Iterable[str] = ()) -> nn.Module:
     """Return the network that ``config`` describes, without any weights of its own.
 
-    A node with ``_target_`` stands for a class of raytran's networks, the other keys for its arguments; there
-    is nothing else: no functions, no classes that a module has only imported, no references to resolve.
+    A node with ``_target_`` stands for a class of raytran's networks, or of a package in ``trust``, the other
+    keys for its arguments; there is nothing else: no functions, no classes that a module has only imported
+    from elsewhere, no references to resolve.
 
     Args:
         config: the config from a checkpoint.
         source: what to name in messages: the file.
+        trust: see ``trusted_packages``.
 
     Raises:
         CheckpointError: the config asks for anything else; that is then neither imported nor run. Or the
-            classes do not take these arguments.
+            classes do not take these arguments, or a package in ``trust`` is not installed.
+        ConfigError: see ``trusted_packages``.
     """
+    trusted = trusted_packages(trust)
     try:
-        built = _build(config, source)
+        built = _build(config, source, trusted)
     except (TypeError, ValueError, RuntimeError, AttributeError, KeyError, IndexError, MemoryError) as error:
+        whose = " or ".join(("raytran", *(name for name in own_packages(config) if name in trusted)))
         raise CheckpointError(
             f"the network described in {source} cannot be built ({str(error).splitlines()[0]}): "
-            "the file is of another version of raytran, or damaged"
+            f"the file is of another version of {whose}, or damaged"
         ) from error
     if not isinstance(built, nn.Module):
         raise CheckpointError(f"{source} describes no network: do not use this file")
     return built
 
 
-def _build(node: Any, source: object) -> Any:
+def _build(node: Any, source: object, trusted: tuple[str, ...]) -> Any:
     if isinstance(node, Mapping):
-        values = {name: _build(value, source) for name, value in node.items() if name != "_target_"}
+        values = {name: _build(value, source, trusted) for name, value in node.items() if name != "_target_"}
         if any(not isinstance(name, str) or name.startswith("_") for name in values):
             raise CheckpointError(f"the network described in {source} has odd settings: do not use this file")
         if "_target_" not in node:
             return values
+        found = _class(node["_target_"], source, trusted)
         if "weights" in values:
             values["weights"] = None  # they are in the checkpoint: nothing is to be read or fetched
-        for name in _NOT_THE_NETWORK:
-            values.pop(name, None)
-        return _class(node["_target_"], source)(**values)
+        if found.__module__.partition(".")[0] == _PACKAGE:
+            for name in _NOT_THE_NETWORK:
+                values.pop(name, None)
+        return found(**values)
     if isinstance(node, list | tuple):
-        return [_build(value, source) for value in node]
+        return [_build(value, source, trusted) for value in node]
     if not isinstance(node, _PLAIN):
         raise CheckpointError(f"the network described in {source} has odd settings: do not use this file")
     return node
 
 
-def _class(target: Any, source: object) -> type[nn.Module]:
-    """Return the class of that name, if it is one of raytran's own networks."""
+def _class(target: Any, source: object, trusted: tuple[str, ...]) -> type[nn.Module]:
+    """Return the class of that name, if it is a network of raytran or of a trusted package."""
     module, _, name = str(target).rpartition(".")
+    package = module.partition(".")[0]
     # The name is looked at before anything is imported: an import runs code as well.
     if _MODULE.fullmatch(module):
-        try:
-            found = getattr(importlib.import_module(module), name, None)
-        except ModuleNotFoundError:
-            found = None
-        if isinstance(found, type) and issubclass(found, nn.Module) and found.__module__ == module:
+        found = _attribute(module, name)
+        if _is_network(found) and found.__module__ == module:
             return found
+    elif package in trusted:
+        # A class may be named where its package shows it, but it must be of a trusted package itself.
+        found = _attribute(module, name)
+        if _is_network(found) and found.__module__.partition(".")[0] in trusted:
+            return found
+        raise CheckpointError(
+            f"{source} asks for '{target}', and there is no torch.nn.Module of that name in {package}: "
+            f"set PYTHONPATH so that Python finds the {package} it was trained with"
+        )
+    advice = f", or if you know it and {package} is a package of yours, give trust=[{package}]"
     raise CheckpointError(
         f"{source} asks to run '{target}', which is no network of raytran: do not use this file"
+        + (advice if package.isidentifier() and package != _PACKAGE else "")
     )
+
+
+def _attribute(module: str, name: str) -> Any:
+    """Return what a module has under ``name``; None if there is no such module, or no such name in it."""
+    try:
+        return getattr(importlib.import_module(module), name, None)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise  # it is there, and lacks something itself
+        return None
+
+
+def _is_network(found: Any) -> bool:
+    return isinstance(found, type) and issubclass(found, nn.Module)

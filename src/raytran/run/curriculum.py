@@ -18,7 +18,7 @@ from omegaconf import DictConfig
 
 from raytran.data.atomic import write_json
 from raytran.errors import ConfigError, RaytranError
-from raytran.run.entry import compose, quoted, user_environment
+from raytran.run.entry import compose, quoted, typed_config_dir, user_environment
 from raytran.run.folders import LAST, read_finished, write_finished
 from raytran.run.train import FitResult, train
 from raytran.training.callbacks.stop_signals import SIGNALS
@@ -85,7 +85,7 @@ def _fit(settings: Sequence[str], folder: Path) -> FitResult:
     cfg = compose("train", settings)
     if str(cfg.trainer.devices) == "1" and cfg.trainer.num_nodes == 1:
         return train(cfg)
-    code = _run([sys.executable, "-m", "raytran.train", *settings])
+    code = _run([sys.executable, "-m", "raytran.train", *_config_dir(), *settings])
     finished = read_finished(folder)
     if code != 0 or finished is None:
         raise RaytranError(
@@ -93,6 +93,10 @@ def _fit(settings: Sequence[str], folder: Path) -> FitResult:
             "then give the same command again to continue"
         )
     return FitResult(folder, folder / LAST, finished.steps, 0.0, {})
+
+
+def _config_dir() -> list[str]:
+    return typed_config_dir(HydraConfig.get()) if HydraConfig.initialized() else []
 
 
 def _run(command: Sequence[str]) -> int:

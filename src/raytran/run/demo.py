@@ -19,10 +19,11 @@ from raytran.errors import ConfigError
 from raytran.model import RayTran
 from raytran.run.build import build_data, plain
 from raytran.run.checkpoint import load_model, prediction_settings
+from raytran.run.checkpoint_config import own_packages
 from raytran.run.curriculum import run_curriculum
 from raytran.run.demo_page import COLUMNS, ShownScene, headline, write_page
 from raytran.run.entry import compose
-from raytran.run.evaluate import TASKS_WITH_SHAPE, evaluate_model
+from raytran.run.evaluate import TASKS_WITH_SHAPE, about_data, evaluate_model
 from raytran.run.predict import predict_scene
 from raytran.run.scene_files import write_scene
 from raytran.run.steps import StepTimes
@@ -53,12 +54,14 @@ class Asked:
         checkpoint: its file.
         data: rooms, with the images and the grid that the network wants.
         split: which of them.
+        num_views: frames of each.
     """
 
     model: RayTran
     checkpoint: Path
     data: SceneDataModule
     split: str
+    num_views: int
 
 
 @dataclass(frozen=True)
@@ -134,8 +137,11 @@ def _train(overrides: Sequence[str], folder: Path, times: StepTimes) -> list[Fit
 
 def _asked(overrides: Sequence[str], data: SceneDataModule, checkpoint: Path) -> dict[str, Asked]:
     """Return who is asked about what, by ``COLUMNS``: the package's weights too, if it has any."""
-    model = load_model(checkpoint)
-    asked = {split: Asked(model, checkpoint, data, split) for split in ("train", "val")}
+    # The network was composed from what is typed here, not out of a file: its own classes are trusted.
+    cfg = compose("train", [*overrides, *_SETTINGS, "output_dir=unused"])
+    model = load_model(checkpoint, trust=own_packages(plain(cfg.model)))
+    views = int(cfg.views.predict_views)
+    asked = {split: Asked(model, checkpoint, data, split, views) for split in ("train", "val")}
     shipped = shipped_weights()
     if shipped is not None:
         model, wanted = load_model(shipped), prediction_settings(shipped)
@@ -147,12 +153,12 @@ def _asked(overrides: Sequence[str], data: SceneDataModule, checkpoint: Path) ->
         }
         settings = [f"{name}={list(value)}" for name, value in fit.items()]
         cfg = compose("train", [*overrides, *_SETTINGS, *settings])
-        asked["shipped"] = Asked(model, shipped, build_data(cfg), "val")
+        asked["shipped"] = Asked(model, shipped, build_data(cfg), "val", views)
     return asked
 
 
 def _evaluate(cfg: DictConfig, asked: Asked, output: Path) -> dict[str, Any]:
-    about = {"checkpoint": str(asked.checkpoint), "data": str(asked.data.root), "split": asked.split}
+    about = {"checkpoint": str(asked.checkpoint), **about_data(asked.data, asked.split, asked.num_views)}
     return evaluate_model(
         asked.model,
         asked.data.split(asked.split),

@@ -102,6 +102,17 @@ def user_environment() -> dict[str, str]:
     return environment if _TYPED_FULL_ERROR is None else environment | {_FULL_ERROR: _TYPED_FULL_ERROR}
 
 
+def typed_config_dir(hydra_config: Any) -> list[str]:
+    """Return ``--config-dir FOLDER`` if it was typed, so that another command finds the same configs.
+
+    Args:
+        hydra_config: the part ``hydra`` of the config of the command at work.
+    """
+    sources = hydra_config.runtime.config_sources
+    folders = [str(Path(source.path).absolute()) for source in sources if source.provider == "command-line"]
+    return ["--config-dir", *folders] if folders else []
+
+
 def run_or_exit(function: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
     """Return ``function(cfg)``; a mistake of the user's becomes a sentence on stderr and exit code 1."""
     try:

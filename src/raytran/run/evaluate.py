@@ -17,18 +17,23 @@ from rich.progress import track
 from rich.table import Table
 from torch.utils.data import Dataset, Subset
 
+from raytran.data.views import RepeatedFrames
 from raytran.errors import ConfigError
 from raytran.metrics.curves import accuracy_by_scene_size
 from raytran.model import RayTran
+from raytran.run.accuracy_figure import Curves, draw_figure, read_curves
 from raytran.run.build import build_data
 from raytran.run.checkpoint import PredictionSettings, load_model, prediction_settings
+from raytran.run.checkpoint_config import trusted_packages
 from raytran.run.device import choose_device
 from raytran.run.entry import compose
 from raytran.run.evaluate_views import FILES, evaluate_views, views_table
 from raytran.run.output import check_replaceable, replaced_folder
 from raytran.run.score import score, write_csv
+from raytran.training.datamodule import SceneDataModule
 from raytran.training.scores import DUPLICATE_IOU, SCORE_THRESHOLD, SceneScores
 from raytran.types import SceneBatch
+from raytran.view.accuracy_curves import FILE as FIGURE
 
 _log = logging.getLogger(__name__)
 
@@ -50,23 +55,24 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     """
     if (cfg.checkpoint is None) == (cfg.predictions is None):
         raise ConfigError("give either checkpoint=CKPT or predictions=DIR annotations=FILE, not both")
+    beside = read_curves(cfg.draw_with)
     if cfg.predictions is not None:
-        return score(cfg)
+        return score(cfg, beside)
     output = Path(cfg.output)
     check_replaceable(output.resolve(), marker=MARKER)
     settings = prediction_settings(cfg.checkpoint)
-    model = load_model(cfg.checkpoint, attention=cfg.attention).to(choose_device(cfg.device))
+    model = load_model(cfg.checkpoint, attention=cfg.attention, trust=trusted_packages(cfg.trust))
+    model = model.to(choose_device(cfg.device))
     cfg = _in_its_preset(cfg, settings)
     # The stages before it leave the shape head untrained.
     tasks = TASKS_WITH_SHAPE if settings.stage == "shape" else TASKS
     _make_data_fit(cfg, settings, model, tasks)
     data = build_data(cfg)
     data.prepare_data()
-    scenes, title = with_at_most(cfg.max_objects, data.split(cfg.split)), f"{cfg.split} scenes of {data.root}"
-    about = {
+    scenes = with_at_most(cfg.max_objects, data.split(cfg.split))
+    title = f"{cfg.split} scenes of {data.root}, {cfg.views.num_views} frames each"
+    about = about_data(data, cfg.split, cfg.views.num_views) | {
         "checkpoint": str(cfg.checkpoint),
-        "data": str(data.root),
-        "split": cfg.split,
         "max_objects": cfg.max_objects,
     }
     if settings.stage == "view":
@@ -83,10 +89,16 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
         duplicate_iou=cfg.duplicate_iou,
         views_at_once=cfg.views_at_once,
         about=about,
+        beside=beside,
     )
     Console().print(metrics_table(metrics, title=f"{settings.preset}, {title}"))
-    _log.info("wrote %s: metrics.json, per_scene.csv, per_object.csv", output.resolve())
+    _log.info("wrote %s: metrics.json, per_scene.csv, per_object.csv, %s", output.resolve(), FIGURE)
     return metrics
+
+
+def about_data(data: SceneDataModule, split: str, num_views: int) -> dict[str, Any]:
+    """Return what ``metrics.json`` says of the scenes: data set, folder, split, and frames that went in."""
+    return {"dataset": data.name, "data": str(data.root), "split": split, "num_views": num_views}
 
 
 def _in_its_preset(cfg: DictConfig, settings: PredictionSettings) -> DictConfig:
@@ -111,8 +123,9 @@ def _make_data_fit(
     else:
         cfg.stage.new_views = 0
     cfg.model.grid_resolution, cfg.model.grid_extent = list(model.grid_resolution), list(model.grid_extent)
-    # One that was trained with the true masks as a fourth channel gets them here.
-    cfg.data.dataset.input_mask = model.backbone.resnet.input_channels == 4
+    # One that was trained with true masks as a fourth channel gets the same here, unless another is typed.
+    mask = cfg.data.dataset.input_mask or settings.input_mask or "amodal"
+    cfg.data.dataset.input_mask = mask if model.backbone.resnet.input_channels == 4 else None
 
 
 def with_at_most(max_objects: int | None, dataset: Any) -> Dataset[SceneBatch]:
@@ -143,7 +156,8 @@ def evaluate_model(
     score_threshold: float = SCORE_THRESHOLD,
     duplicate_iou: float | None = DUPLICATE_IOU,
     views_at_once: int | None = None,
-    about: Mapping[str, str] | None = None,
+    about: Mapping[str, Any] | None = None,
+    beside: Mapping[str, Curves] | None = None,
     progress: bool = True,
 ) -> dict[str, Any]:
     """Predict every scene of a data set and compare with its annotation.
@@ -153,12 +167,13 @@ def evaluate_model(
         dataset: scenes with targets, each a ``SceneBatch`` with B = 1.
         tasks: what to compare: ``TASKS``, or with the shapes of the objects found ``TASKS_WITH_SHAPE``, for
             which the scenes must have shapes.
-        output: folder for ``metrics.json``, ``per_scene.csv`` and ``per_object.csv``, which appear together
-            or not at all; None writes nothing.
+        output: folder for ``metrics.json``, ``per_scene.csv``, ``per_object.csv`` and
+            ``accuracy_curves.png``, which appear together or not at all; None writes nothing.
         score_threshold: objects with a lower score do not count as predicted.
         duplicate_iou: nor does one that overlaps a surer one of its class by more than this IoU.
         views_at_once: views that pass through the network together, None for all.
         about: what to say beside the numbers, e.g. the checkpoint.
+        beside: accuracy curves of other results for the figure, by name.
         progress: show a progress bar.
 
     Returns:
@@ -174,8 +189,11 @@ def evaluate_model(
         volume_extent=model.grid_extent,
     ).to(device)
     model.eval()
+    repeated = RepeatedFrames()
     for index in track(range(len(dataset)), "evaluating", disable=not progress, transient=True):  # type: ignore[arg-type]
-        _predict_and_compare(model, dataset[index].to(device), scores, score_threshold, views_at_once)
+        batch = dataset[index]
+        repeated.look(batch)
+        _predict_and_compare(model, batch.to(device), scores, score_threshold, views_at_once)
     settings = {"score_threshold": score_threshold, "duplicate_iou": duplicate_iou}
     metrics = {**(about or {}), **settings, **_by_protocol(scores)}
     if output is not None:
@@ -183,6 +201,7 @@ def evaluate_model(
             (folder / MARKER).write_text(json.dumps(metrics, indent=2) + "\n")
             write_csv(folder / "per_scene.csv", scores.rows("scene"))
             write_csv(folder / "per_object.csv", scores.rows("object"))
+            draw_figure(folder, output.name, metrics["strict"]["curves"], beside or {})
     return metrics
 
 

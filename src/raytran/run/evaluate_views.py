@@ -13,6 +13,7 @@ from rich.progress import track
 from rich.table import Table
 from torch.utils.data import Dataset
 
+from raytran.data.views import RepeatedFrames
 from raytran.metrics import NewViewScores
 from raytran.model import RayTran, inputs_of
 from raytran.run.output import replaced_folder
@@ -50,8 +51,10 @@ def evaluate_views(
     device = next(model.parameters()).device
     scores = NewViewScores().to(device)
     model.eval()
+    repeated = RepeatedFrames()
     for index in track(range(len(dataset)), "evaluating", disable=not progress, transient=True):  # type: ignore[arg-type]
         batch = dataset[index].to(device)
+        repeated.look(batch)
         raw = model(**inputs_of(batch), tasks=("view",), views_at_once=views_at_once)
         (prediction,) = model.decode(raw, batch.scene_id)
         if prediction.new_views is not None and batch.new_views is not None:

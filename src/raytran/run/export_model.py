@@ -15,8 +15,10 @@ from rich.table import Table
 from raytran.errors import ConfigError
 from raytran.run.build import plain
 from raytran.run.checkpoint import model_from, prediction_settings
+from raytran.run.checkpoint_config import trusted_packages
 from raytran.run.export_program import SUFFIX as PROGRAM_SUFFIX
 from raytran.run.export_program import export_program
+from raytran.run.known_data import KnownData
 from raytran.run.weights import checkpoint_path, export_weights
 from raytran.training.checkpoint_file import read_checkpoint
 from raytran.training.weights_file import PREFIX, SUFFIX
@@ -42,7 +44,8 @@ def export_model(cfg: DictConfig) -> Path | None:
     output = Path(cfg.output)
     _check_output(source, output)
     checkpoint = read_checkpoint(source)
-    model = model_from(checkpoint, source)  # what cannot be loaded is not given away
+    # What cannot be loaded is not given away.
+    model = model_from(checkpoint, source, trust=trusted_packages(cfg.trust))
     if output.suffix == SUFFIX:
         export_weights(checkpoint, source, output, dtype=cfg.dtype)
     else:
@@ -68,11 +71,13 @@ def described(checkpoint: Mapping[str, Any], path: Path) -> Table:
         "stage": checkpoint["stage"],
         "steps": checkpoint.get("global_step"),
         "parent": f"stage {parent['stage']}, {parent['step']} steps" if parent else None,
+        "trained on": str(known) if (known := KnownData.of_checkpoint(checkpoint)) else None,
         "weights": f"{sum(value.numel() for value in weights) / 1e6:.2f} M, {', '.join(dtypes)}",
         "images": f"{views.get('image_size')}, {views.get('predict_views')} a scene",
         "raytran": versions.get("raytran"),
         "commit": checkpoint.get("git_commit"),
         "torch": versions.get("torch"),
+        "WARNING": "; ".join(checkpoint.get("warnings") or ()) or None,
         **{name: score for name, score in (checkpoint.get("scores") or {}).items() if _is_summary(name)},
     }
     table = Table("", "", title=str(path), show_header=False)

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from omegaconf import OmegaConf
 
@@ -40,6 +41,8 @@ class Finished:
         checkpoint: path of the final checkpoint, relative to the run's folder.
         steps: optimiser steps taken.
         time: when it finished, UTC, ISO 8601.
+        data: what it was trained on, see ``KnownData``; None for a curriculum, and for runs from before this
+            was written down.
     """
 
     stage: str
@@ -48,6 +51,7 @@ class Finished:
     checkpoint: str
     steps: int
     time: str
+    data: dict[str, Any] | None = None
 
 
 @contextmanager
@@ -75,10 +79,18 @@ def one_at_a_time(folder: Path) -> Iterator[int]:
         yield file.fileno()
 
 
-def write_finished(folder: Path, *, stage: str, preset: str, experiment: str, steps: int) -> Finished:
+def write_finished(
+    folder: Path,
+    *,
+    stage: str,
+    preset: str,
+    experiment: str,
+    steps: int,
+    data: dict[str, Any] | None = None,
+) -> Finished:
     """Mark the run in ``folder`` as finished and return the mark."""
     now = datetime.now(UTC).isoformat()
-    mark = Finished(stage, preset, experiment, LAST.as_posix(), steps, now)
+    mark = Finished(stage, preset, experiment, LAST.as_posix(), steps, now, data)
     write_json(folder / FINISHED, asdict(mark))
     return mark
 
@@ -100,8 +112,10 @@ def read_finished(folder: Path) -> Finished | None:
         ) from error
 
 
-def newest_finished(outputs: Path, *, preset: str, stage: str, experiment: str | None = None) -> Path | None:
-    """Return the checkpoint of the newest finished run of ``stage`` with ``preset``, if there is one.
+def finished_runs(
+    outputs: Path, *, preset: str, stage: str, experiment: str | None = None
+) -> list[tuple[Path, Finished]]:
+    """Return the checkpoints of the finished runs of ``stage`` with ``preset`` and their marks, newest first.
 
     Args:
         outputs: top folder of all runs.
@@ -117,8 +131,8 @@ def newest_finished(outputs: Path, *, preset: str, stage: str, experiment: str |
         if experiment in (None, mark.experiment):
             checkpoint = path.parent / mark.checkpoint
             if checkpoint.is_file():
-                found.append((mark.time, checkpoint))
-    return max(found)[1] if found else None
+                found.append((checkpoint, mark))
+    return sorted(found, key=lambda run: (run[1].time, run[0]), reverse=True)
 
 
 def newest_unfinished(parent: Path, holds: Path) -> Path | None:

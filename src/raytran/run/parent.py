@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from raytran.errors import CheckpointError, ConfigError
-from raytran.run.folders import newest_finished
+from raytran.run.folders import finished_runs
+from raytran.run.known_data import KnownData
 from raytran.run.settings import RunConfig
 from raytran.run.weights import checkpoint_path
+from raytran.training.checkpoint_file import read_checkpoint
 from raytran.training.stage import Stage
 
 _log = logging.getLogger(__name__)
@@ -27,12 +29,14 @@ class Parent:
         stage: name of its stage.
         step: optimiser steps it had taken.
         scores: its last validation, by name.
+        data: what it was trained on, see ``KnownData.as_plain``; None if it does not say.
     """
 
     path: str
     stage: str
     step: int
     scores: dict[str, float]
+    data: dict[str, Any] | None = None
 
     @staticmethod
     def of(path: Path, checkpoint: Mapping[str, Any]) -> Parent:
@@ -43,7 +47,9 @@ class Parent:
         """
         try:
             scores = {name: float(value) for name, value in checkpoint.get("scores", {}).items()}
-            return Parent(str(path), checkpoint["stage"], int(checkpoint.get("global_step", 0)), scores)
+            known = KnownData.of_checkpoint(checkpoint)
+            step, data = int(checkpoint.get("global_step", 0)), None if known is None else known.as_plain()
+            return Parent(str(path), checkpoint["stage"], step, scores, data)
         except (AttributeError, TypeError, ValueError) as error:
             raise CheckpointError(f"{path} says odd things of itself ({error}): it is damaged") from error
 
@@ -52,28 +58,53 @@ class Parent:
         return asdict(self)
 
 
-def find_parent(run: RunConfig, stage: Stage) -> Path | None:
-    """Return the checkpoint whose weights a new run starts from, None to start from scratch.
+def find_parent(run: RunConfig, stage: Stage, data: KnownData) -> tuple[Path, dict[str, Any]] | None:
+    """Return the checkpoint whose weights a new run starts from and its content, None to start from scratch.
+
+    ``init_from=auto`` takes the newest finished run of the parent stage on the same data.
+
+    Args:
+        run: the switches.
+        stage: the stage to train.
+        data: what it is to be trained on.
 
     Raises:
-        ConfigError: ``init_from=auto`` finds no finished run of the parent stage.
-        CheckpointError: ``init_from=default``, and the package was built without weights.
+        ConfigError: ``init_from=auto`` finds no finished run of the parent stage on these data.
+        CheckpointError: the checkpoint is missing or damaged; or it is ``default``, and the package was built
+            without weights.
     """
     if run.init_from not in ("auto", "none"):
-        return checkpoint_path(run.init_from)
+        path = checkpoint_path(run.init_from)
+        return path, read_checkpoint(path)
     if run.init_from == "none" or stage.parent is None:
         return None
-    found = newest_finished(
+    others: list[str] = []
+    for path, mark in finished_runs(
         Path(run.outputs), preset=run.preset, stage=stage.parent, experiment=stage.parent_experiment
-    )
-    if found is None:
-        raise ConfigError(
-            f"no finished run of stage {stage.parent} with preset {run.preset} under "
-            f"{Path(run.outputs).resolve()}: run `python -m raytran.train "
-            f"experiment={stage.parent_experiment} preset={run.preset}` first, "
+    ):
+        content = None if mark.data else read_checkpoint(path)
+        known = KnownData.of_checkpoint({"data": mark.data} if content is None else content)
+        if known is None or known.is_same(data):
+            return path, read_checkpoint(path) if content is None else content
+        others.append(f"{path} on {known}")
+    raise ConfigError(_no_parent(run, stage, data, others))
+
+
+def _no_parent(run: RunConfig, stage: Stage, data: KnownData, others: list[str]) -> str:
+    first = f"`python -m raytran.train experiment={stage.parent_experiment} preset={run.preset}"
+    where = f"under {Path(run.outputs).resolve()}"
+    if not others:
+        return (
+            f"no finished run of stage {stage.parent} with preset {run.preset} {where}: run {first}` first, "
             "or give init_from=CHECKPOINT, or init_from=none to start from scratch"
         )
-    return found
+    more = f" and {len(others) - 1} more" if len(others) > 1 else ""
+    return (
+        f"no finished run of stage {stage.parent} with preset {run.preset} {where} "
+        f"was trained on {data}, only on other data ({others[0]}{more}): run {first} {data.typed()}` first, "
+        "or give init_from=CHECKPOINT to start from other data all the same, or init_from=none to start "
+        "from scratch"
+    )
 
 
 def check_parent(parent: Parent, stage: Stage, check: str) -> None:

@@ -20,6 +20,7 @@ from raytran.losses.total import TotalLoss
 from raytran.model import RayTran, inputs_of
 from raytran.parcel import Parcel
 from raytran.run.checkpoint import model_from
+from raytran.run.checkpoint_config import trusted_packages
 from raytran.run.device import choose_device
 from raytran.training.replay_file import read_replay
 from raytran.training.stage import Stage
@@ -56,7 +57,7 @@ def replay(cfg: DictConfig) -> Replayed:
     if precision not in PRECISIONS:
         raise ConfigError(f"unknown precision={precision}: choose one of {', '.join(PRECISIONS)}")
     device = choose_device(cfg.device)
-    model, loss, stage = _parts(content, path)
+    model, loss, stage = _parts(content, path, trusted_packages(cfg.trust))
     stage.freeze(model.to(device))
     stage.set_modes(model)
     found = run_step(
@@ -123,25 +124,29 @@ def _is_finite(value: Any) -> bool:
     return all(map(_is_finite, value)) if isinstance(value, tuple | list) else True
 
 
-def _parts(content: Mapping[str, Any], path: Path) -> tuple[RayTran, TotalLoss, Stage]:
-    """Return network, loss and stage; the file may come from anybody, so none of its classes is run."""
-    model = model_from(content, path)
+def _parts(
+    content: Mapping[str, Any], path: Path, trust: tuple[str, ...]
+) -> tuple[RayTran, TotalLoss, Stage]:
+    """Return network, loss and stage; the file may come from anybody, so only trusted classes are run."""
+    model = model_from(content, path, trust=trust)
     try:
         loss, stage = content["config"]["loss"], dict(content["config"]["stage"])
         if stage.pop("_target_") != "raytran.training.stage.Stage":
             raise KeyError("stage")
         if loss["_target_"] != "raytran.losses.total.TotalLoss":
             raise KeyError("loss")
-        matcher = HungarianMatcher(weights=loss["matcher"]["weights"])
-        total = TotalLoss(
-            weights=loss["weights"], matcher=matcher, no_object_weight=float(loss["no_object_weight"])
-        )
+        matcher = HungarianMatcher(**_without_target(loss["matcher"]))
+        total = TotalLoss(**_without_target(loss) | {"matcher": matcher})
         return model, total, Stage(**stage)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise CheckpointError(
             f"{path} was written with a stage or a loss of another kind than raytran's: replay it in Python "
             "with raytran.run.replay.run_step"
         ) from error
+
+
+def _without_target(node: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in node.items() if name != "_target_"}
 
 
 def _show(found: Replayed, title: str) -> None:

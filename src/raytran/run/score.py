@@ -15,6 +15,7 @@ from rich.console import Console
 
 from raytran.errors import ConfigError
 from raytran.metrics.records import Row
+from raytran.run.accuracy_figure import Curves, draw_figure
 from raytran.run.output import check_replaceable, replaced_folder
 from raytran.run.score_files import PredictionFiles, read_predictions
 from raytran.run.score_protocols import (
@@ -27,14 +28,19 @@ from raytran.run.score_protocols import (
     score_protocol,
 )
 from raytran.run.score_table import atlas_table, comparison_table, scores_table
+from raytran.view.accuracy_curves import FILE as FIGURE
 
 _log = logging.getLogger(__name__)
 
 MARKER = "metrics.json"
 
 
-def score(cfg: DictConfig) -> dict[str, Any]:
+def score(cfg: DictConfig, beside: Mapping[str, Curves]) -> dict[str, Any]:
     """Run ``python -m raytran.evaluate predictions=DIR annotations=FILE``; see ``conf/evaluate.yaml``.
+
+    Args:
+        cfg: the config of ``evaluate``.
+        beside: accuracy curves of other results for the figure, by name.
 
     Returns:
         The content of ``metrics.json``.
@@ -62,6 +68,7 @@ def score(cfg: DictConfig) -> dict[str, Any]:
         output=Path(cfg.output),
         num_resamples=cfg.num_resamples,
         seed=cfg.seed,
+        beside=beside,
     )
     console = Console()
     console.print(scores_table(metrics, title=str(cfg.predictions)))
@@ -85,6 +92,7 @@ def score_predictions(
     output: Path | None = None,
     num_resamples: int = 2000,
     seed: int = 0,
+    beside: Mapping[str, Curves] | None = None,
 ) -> dict[str, Any]:
     """Score the predictions for many scenes.
 
@@ -99,6 +107,8 @@ def score_predictions(
         output: folder for the results, which appear together or not at all, or None.
         num_resamples: draws of the bootstrap.
         seed: of the bootstrap.
+        beside: accuracy curves of other results for the figure, by name; those of ``compare_with`` are there
+            in any case.
 
     Returns:
         by protocol what its metric returns and ``confidence`` intervals; ``comparison`` by protocol.
@@ -111,7 +121,10 @@ def score_predictions(
         check_replaceable(output.resolve(), marker=MARKER)
     truth = read_truth(annotations, split=split, scans=scans)
     files, scores = _by_protocol(protocol, predictions, truth, volume_extent)
-    metrics = {"predictions": str(predictions), "annotations": str(annotations), **files.counts()}
+    about = {"predictions": predictions, "annotations": annotations, "split": split}
+    metrics: dict[str, Any] = {name: None if path is None else str(path) for name, path in about.items()}
+    metrics |= files.counts()
+    drawn = dict(beside or {})
     chance = {"num_resamples": num_resamples, "seed": seed}
     for name, part in scores.items():
         metrics[name] = part.metrics | {"confidence": confidence(part, **chance)}
@@ -120,8 +133,10 @@ def score_predictions(
         metrics["comparison"] = {
             name: compare(part, others[name], **chance) for name, part in scores.items() if name in others
         }
+        if "strict" in others:
+            drawn = {str(compare_with): others["strict"].metrics["curves"], **drawn}
     if output is not None:
-        _write(output, metrics, scores)
+        _write(output, metrics, scores, drawn)
     return metrics
 
 
@@ -135,7 +150,12 @@ def _by_protocol(
     }
 
 
-def _write(output: Path, metrics: Mapping[str, Any], scores: Mapping[str, ProtocolScores]) -> None:
+def _write(
+    output: Path,
+    metrics: Mapping[str, Any],
+    scores: Mapping[str, ProtocolScores],
+    beside: Mapping[str, Curves],
+) -> None:
     tables: dict[str, list[Row]] = {
         "per_object.csv": [
             {"protocol": name, **row} for name, part in scores.items() for row in part.objects
@@ -150,10 +170,13 @@ def _write(output: Path, metrics: Mapping[str, Any], scores: Mapping[str, Protoc
             misses = [row for row in scores["strict"].objects if row["cause"] != "found"]
             content = {**metrics["strict"]["atlas"], "misses": misses}
             (folder / "atlas.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+            name = str(metrics["predictions"]) if beside else output.name
+            draw_figure(folder, name, metrics["strict"]["curves"], beside)
 
 
 def _written(metrics: Mapping[str, Any]) -> list[str]:
-    return [MARKER, "per_object.csv", "per_scene.csv", *(["atlas.json"] if "strict" in metrics else [])]
+    of_strict = ["atlas.json", FIGURE] if "strict" in metrics else []
+    return [MARKER, "per_object.csv", "per_scene.csv", *of_strict]
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:

@@ -9,6 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from raytran.errors import ConfigError
+from raytran.run.checkpoint_config import trusted_packages
 
 PROGRESS_BARS = ("rich", "tqdm", "none")
 PARENT_CHECKS = ("scores", "stage", "none")
@@ -31,6 +32,7 @@ class RunConfig:
         compile: run the network through ``torch.compile``.
         checkpoint_every: optimiser steps between two writings of the last checkpoint.
         progress_bar: ``rich``, ``tqdm`` or ``none``.
+        trust: packages of one's own whose classes the network names, see ``trusted_packages``.
     """
 
     preset: str
@@ -44,6 +46,7 @@ class RunConfig:
     compile: bool
     checkpoint_every: int
     progress_bar: str
+    trust: list[str]
 
     @staticmethod
     def read(cfg: DictConfig) -> RunConfig:
@@ -69,4 +72,5 @@ class RunConfig:
             )
         if typed.checkpoint_every < 1:
             raise ConfigError(f"checkpoint_every must be at least 1, got {typed.checkpoint_every}")
+        trusted_packages(typed.trust)
         return typed

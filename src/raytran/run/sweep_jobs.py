@@ -18,7 +18,7 @@ from types import FrameType
 
 from omegaconf import DictConfig
 
-from raytran.run.entry import quoted, user_environment
+from raytran.run.entry import quoted, typed_config_dir, user_environment
 from raytran.run.folders import read_finished
 from raytran.run.sweep_folder import THIS_SWEEP, last_value, own_settings
 from raytran.run.sweep_table import FAILED, FINISHED, FINISHED_BEFORE, NOT_STARTED, STOPPED, JobResult
@@ -70,7 +70,7 @@ class Job:
         usual = {"resume": "auto", "progress_bar": "none"}
         added = [f"{name}={value}" for name, value in usual.items() if name not in typed]
         words = [*own, *added, f"output_dir={quoted(self.folder)}", *general, "hydra.mode=RUN"]
-        return [sys.executable, "-m", f"raytran.{self.program}", *words]
+        return [sys.executable, "-m", f"raytran.{self.program}", *typed_config_dir(self.config.hydra), *words]
 
     def gpus(self, total: int) -> int:
         """Return how many of the machine's ``total`` GPUs the job needs for itself."""

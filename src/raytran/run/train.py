@@ -6,10 +6,11 @@ from __future__ import annotations
 import logging
 import time
 import warnings
+from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import lightning.pytorch as pl
 from lightning.pytorch.utilities import rank_zero_only
@@ -21,6 +22,7 @@ from raytran.errors import CheckpointError, ConfigError
 from raytran.run.build import build_data, build_model, build_module, build_trainer, plain
 from raytran.run.checkpoint import checkpoint_card, load_weights, parts_afresh
 from raytran.run.folders import LAST, one_at_a_time, read_finished, write_finished
+from raytran.run.known_data import KnownData
 from raytran.run.memory import explained_out_of_memory
 from raytran.run.parent import Parent, check_parent, find_parent
 from raytran.run.provenance import provenance
@@ -31,7 +33,15 @@ from raytran.training.checkpoint_file import read_checkpoint, read_newest
 from raytran.training.reconstruction import Reconstruction
 from raytran.training.stage import Stage
 
+if TYPE_CHECKING:
+    from raytran.model import RayTran
+
 _log = logging.getLogger(__name__)
+
+RANDOM_ENCODER = (
+    "IMAGE ENCODER STARTS FROM RANDOM WEIGHTS: model.backbone.resnet.weights=auto found no ImageNet weights"
+)
+"""In every checkpoint that comes of such a start, those of later stages included."""
 
 
 @dataclass(frozen=True)
@@ -74,19 +84,27 @@ def _train(cfg: DictConfig, run: RunConfig, folder: Path) -> FitResult:
     """Train what is left to train."""
     pl.seed_everything(run.seed, workers=True, verbose=False)
     _quiet()
-    module, resume_from, parent = _start(cfg, run)
-    card = checkpoint_card(stage=module.stage.name, preset=run.preset, config=plain(cfg), parent=parent)
+    config = plain(cfg)
+    start = _start(cfg, run)
+    module = start.module
+    card = checkpoint_card(
+        stage=module.stage.name,
+        preset=run.preset,
+        config=config,
+        parent=start.parent,
+        warnings=start.warnings,
+    )
     trainer = build_trainer(cfg, run, card)
     data = build_data(cfg)
     if trainer.is_global_zero:
         _describe_run(cfg, folder)
     _log.info("stage %s, %d steps, in %s", module.stage.name, trainer.max_steps, folder)
-    for line in start_report(module.stage, module.model, parent):
+    for line in start_report(module.stage, module.model, card, trust=run.trust):
         _log.info("%s", line)
     began = time.monotonic()
     try:
         with explained_out_of_memory(cfg):
-            trainer.fit(module, data, ckpt_path=resume_from)
+            trainer.fit(module, data, ckpt_path=start.resume_from)
     except StopRequestedError as stop:
         # One rank tells the shell; Lightning and torchrun would take codes of the others for a crash.
         raise SystemExit(128 + stop.signum if trainer.is_global_zero else 0) from stop
@@ -101,6 +119,7 @@ def _train(cfg: DictConfig, run: RunConfig, folder: Path) -> FitResult:
             preset=run.preset,
             experiment=run.experiment,
             steps=trainer.global_step,
+            data=KnownData.of_config(config).as_plain(),
         )
     metrics = {name: float(value) for name, value in trainer.logged_metrics.items()}
     _log.info("stage %s finished after %.0f s: %s", module.stage.name, seconds, folder / LAST)
@@ -122,8 +141,24 @@ def _finished_before(run: RunConfig, folder: Path) -> FitResult | None:
     return FitResult(folder, folder / finished.checkpoint, finished.steps, 0.0, {})
 
 
-def _start(cfg: DictConfig, run: RunConfig) -> tuple[Reconstruction, Path | None, dict[str, Any] | None]:
-    """Return the module with its weights, the checkpoint to resume, and what is known of the parent."""
+class _Start(NamedTuple):
+    """Where a fit begins.
+
+    Attributes:
+        module: what is trained, with its weights.
+        resume_from: the checkpoint of the run to go on with, None for a new run.
+        parent: what is known of the checkpoint that the first weights came from, None if there is none.
+        warnings: what anybody who uses the weights should know of them.
+    """
+
+    module: Reconstruction
+    resume_from: Path | None
+    parent: dict[str, Any] | None
+    warnings: Sequence[str]
+
+
+def _start(cfg: DictConfig, run: RunConfig) -> _Start:
+    """Return the module with its weights, and where they are from."""
     found = _to_continue(run)
     if found is not None:
         path, content = found
@@ -141,20 +176,27 @@ def _start(cfg: DictConfig, run: RunConfig) -> tuple[Reconstruction, Path | None
         _log.info("continuing from step %d of %s", content.get("global_step", 0), path)
         for line in changed_settings(content.get("config") or {}, plain(cfg)):
             _log.warning("continued with another setting, %s", line)
-        return module, path, content.get("parent")
+        return _Start(module, path, content.get("parent"), content.get("warnings") or ())
     stage = _stage(cfg)
-    start = find_parent(run, stage)
+    start = find_parent(run, stage, KnownData.of_config(plain(cfg)))
     if start is None:
-        return build_module(cfg, build_model(cfg)), None, None
-    content = read_checkpoint(start)
-    parent = Parent.of(start, content)
+        model = build_model(cfg)
+        return _Start(build_module(cfg, model), None, None, _warnings(model))
+    path, content = start
+    parent = Parent.of(path, content)
     check_parent(parent, stage, run.check_parent)
     module = build_module(cfg, build_model(cfg, pretrained=False))
     afresh = parts_afresh(module.model, content, stage.begins)
     for part in afresh:
         _log.info("%s starts at random: its parent has none that fits, and trained none", part)
-    load_weights(module.model, content, start, afresh=afresh)
-    return module, None, parent.as_plain()
+    load_weights(module.model, content, path, afresh=afresh)
+    return _Start(module, None, parent.as_plain(), content.get("warnings") or ())
+
+
+def _warnings(model: RayTran) -> list[str]:
+    """Return what is to be known of the weights that a network starts from without any parent."""
+    # An encoder of the user's own need not tell.
+    return [RANDOM_ENCODER] if getattr(model.backbone.resnet, "random_fallback", False) else []
 
 
 def _to_continue(run: RunConfig) -> tuple[Path, dict[str, Any]] | None:

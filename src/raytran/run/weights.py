@@ -22,7 +22,10 @@ FOLDER = Path(raytran.__file__).resolve().parent / "weights"
 
 DTYPES = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
 
-_KEPT = ("format", "stage", "preset", "model", "views", "scores", "global_step", "git_commit", "versions")
+_KEPT = (
+    *("format", "stage", "preset", "model", "views", "input_mask", "scores", "global_step", "warnings"),
+    *("git_commit", "versions"),
+)
 """Of what a checkpoint says. The rest is the state of training, and settings that hold a machine's paths."""
 
 
@@ -83,18 +86,21 @@ def _card(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     parent = checkpoint.get("parent")
     if isinstance(parent, Mapping):
         card["parent"] = {name: parent.get(name) for name in ("stage", "step")}
-    return card | {"model": _without_sources(checkpoint["model"])}
+    data = checkpoint.get("data")
+    if isinstance(data, Mapping):
+        card["data"] = {name: data.get(name) for name in ("name", "annotation")}
+    return card | {"model": without_sources(checkpoint["model"])}
 
 
-def _without_sources(node: Any) -> Any:
-    """Leave out where first weights came from, which may be a path; those of the file take their place."""
+def without_sources(node: Any) -> Any:
+    """Return a network's config without where first weights come from: a checkpoint's take their place."""
     if isinstance(node, Mapping):
         is_object = "_target_" in node
         return {
-            name: None if is_object and name == "weights" else _without_sources(value)
+            name: None if is_object and name == "weights" else without_sources(value)
             for name, value in node.items()
         }
-    return [_without_sources(value) for value in node] if isinstance(node, list | tuple) else node
+    return [without_sources(value) for value in node] if isinstance(node, list | tuple) else node
 
 
 def _converted(value: Tensor, dtype: torch.dtype, name: str) -> Tensor:

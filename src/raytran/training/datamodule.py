@@ -36,6 +36,7 @@ class SceneDataModule(pl.LightningDataModule):
         num_workers: loader processes.
         augmentation: random changes of training scenes; validation scenes are never changed.
         seed: of the order of the scenes.
+        name: of the data set, for results and for ``init_from=auto``; None if it has none.
     """
 
     def __init__(
@@ -51,9 +52,11 @@ class SceneDataModule(pl.LightningDataModule):
         num_workers: int = 2,
         augmentation: Augmentation | None = None,
         seed: int = 0,
+        name: str | None = None,
     ) -> None:
         super().__init__()
         self.root = Path(root)
+        self.name = name
         self._dataset = dataset
         self._targets = tuple(targets)
         self._make = make

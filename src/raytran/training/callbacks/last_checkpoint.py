@@ -10,6 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import lightning.pytorch as pl
 
+from raytran.data.scan2cad import annotation_digest
 from raytran.errors import CheckpointError
 from raytran.training.callbacks.stop_signals import StopRequestedError, StopSignals
 from raytran.training.checkpoint_io import AtomicCheckpointIO
@@ -58,6 +59,10 @@ class LastCheckpoint(pl.Callback):
         """Add the card, the scores of the last validation and what an exact resume needs."""
         states = self._random or random_states(pl_module.device)
         checkpoint.update(self._card)
+        data = checkpoint.get("data")
+        if isinstance(data, dict) and data.get("root") is not None:
+            # Data that are made on first use were not there yet when the card was.
+            checkpoint["data"] = {**data, "annotation": annotation_digest(Path(data["root"]))}
         checkpoint["scores"] = dict(self._scores)
         checkpoint["resume"] = {
             "validation_due": self._random is not None,
