@@ -4,19 +4,19 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-fast lint format docs notebooks clean
+.PHONY: help install demo test test-fast lint format docs notebooks resolve clean
 
 help:  ## Show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1|\2/' | column -t -s '|'
 
 install: $(VENV)/.installed  ## Make the virtual environment in .venv with everything that development needs
 
-# torch first: any other package that asks for it would take the newest build, gigabytes of CUDA included.
+# On Linux torch from PyPI brings CUDA, 3 GB to download. Without a GPU its build for CPUs does, if pip finds it:
+#   make install PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu
 $(VENV)/.installed: pyproject.toml requirements/ci.txt
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \
 		{ echo "raytran needs Python 3.11 to 3.13; name one with: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet "$$(grep '^torch==' requirements/ci.txt)"
 	$(BIN)/pip install --quiet --requirement requirements/ci.txt
 	$(BIN)/pip install --quiet --no-deps --editable .
 	@touch $@
@@ -45,6 +45,13 @@ docs: install  ## Write the tables of settings into docs/ from conf/
 
 notebooks: install  ## Execute the notebooks and keep what they print and draw
 	OMP_NUM_THREADS=1 $(BIN)/python notebooks/execute.py
+
+resolve: build/uv/bin/uv  ## Check that PyPI alone has versions for every way to install, Python and torch (downloads no package)
+	PATH="build/uv/bin:$$PATH" requirements/resolve.sh
+
+build/uv/bin/uv:
+	$(PYTHON) -m venv build/uv
+	build/uv/bin/pip install --quiet uv
 
 clean:  ## Remove the virtual environment and caches (not data/, not outputs/)
 	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache dist build

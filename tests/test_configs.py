@@ -106,7 +106,7 @@ def test_trainer_keys_are_arguments(trainer):
 def test_strategies_are_built(trainer):
     strategy = instantiate(plain(train_config(f"trainer={trainer}").trainer.strategy))
     # Other ranks wait while the first makes rooms; torch's default of half an hour would end that.
-    assert strategy._timeout == timedelta(hours=12)
+    assert strategy._timeout == timedelta(minutes=30)
 
 
 def test_the_papers_preset_is_the_default_of_the_code():

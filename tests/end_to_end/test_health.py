@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 from raytran.errors import CheckpointError, ConfigError
-from raytran.run.build import plain
+from raytran.run.build import build_model, plain
 from raytran.run.entry import compose
 from raytran.run.folders import LAST
 from raytran.run.replay import _parts, replay
@@ -54,6 +55,25 @@ def test_the_step_can_be_done_again(lost, capsys):
     said = capsys.readouterr().out
     assert "step 3 of stage occupancy" in said
     assert f"not finite in the forward pass, in order: {found.parts[0]}" in said
+
+
+def test_gradients_overflow_again_by_the_scale_of_the_loss(lost, tmp_path, capsys):
+    folder, _ = lost
+    content = read_checkpoint(folder / "replay.pt")
+    torch.manual_seed(0)
+    fresh = build_model(OmegaConf.create(content["config"]), pretrained=False).state_dict()
+    content["state_dict"] = {f"model.{name}": value for name, value in fresh.items()}
+    content["replay"] |= {"precision": "16-mixed", "scale": 2.0**40}
+    path = tmp_path / "replay.pt"
+    torch.save(content, path)
+    found = replay(compose("replay", [f"file={path}", "device=cpu"]))
+    assert not found.parts
+    assert found.gradients
+    assert "16-mixed on cpu, loss times 1.09951e+12" in capsys.readouterr().out
+    assert not replay(compose("replay", [f"file={path}", "device=cpu", "precision=32-true"])).gradients
+    content["replay"]["scale"] = None
+    torch.save(content, path)
+    assert not replay(compose("replay", [f"file={path}", "device=cpu"])).gradients
 
 
 def test_a_checkpoint_is_no_replay(lost):

@@ -117,6 +117,7 @@ def config(folder, output, **changes) -> DictConfig:
         "device": "cpu",
         "attention": "auto",
         "trust": [],
+        "matmul_precision": "auto",
     }
     return OmegaConf.create(values | changes)
 

@@ -3,6 +3,8 @@ from __future__ import annotations
 
 import subprocess
 
+import torch
+
 from raytran.run.provenance import git_commit, versions
 
 
@@ -32,6 +34,13 @@ def test_a_package_installed_inside_another_repository_has_no_commit(tmp_path):
     package.mkdir(parents=True)
     git(tmp_path, "init", "-q")
     assert git_commit(package) is None
+
+
+def test_versions_name_the_build_of_torch(monkeypatch):
+    """PyPI's wheel for CUDA calls itself 2.13.0 in its metadata."""
+    monkeypatch.setattr("raytran.run.provenance.metadata.version", lambda name: "1.0")
+    assert versions()["torch"] == torch.__version__
+    assert type(versions()["torch"]) is str  # checkpoints hold plain Python
 
 
 def test_versions_name_torch():

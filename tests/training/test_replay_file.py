@@ -15,7 +15,7 @@ CARD = {"format": "raytran.checkpoint/1", "stage": "joint", "preset": "tiny", "m
 
 
 def write(path, batches):
-    write_replay(path, nn.Linear(2, 1), batches, card=CARD, step=7, precision="bf16-mixed")
+    write_replay(path, nn.Linear(2, 1), batches, card=CARD, step=7, precision="16-mixed", scale=1024.0)
 
 
 def test_batches_come_back_as_they_were(batch, tmp_path):
@@ -23,7 +23,8 @@ def test_batches_come_back_as_they_were(batch, tmp_path):
     empty = replace(batch, objects=(ObjectSet.empty(),))
     write(tmp_path / "replay.pt", [batch, bare, empty])
     content, (first, second, third) = read_replay(tmp_path / "replay.pt")
-    assert (content["global_step"], content["replay"]["precision"]) == (7, "bf16-mixed")
+    assert content["global_step"] == 7
+    assert (content["replay"]["precision"], content["replay"]["scale"]) == ("16-mixed", 1024.0)
     assert set(content["state_dict"]) == {"model.weight", "model.bias"}
     assert (first.scene_id, first.frame_id) == (batch.scene_id, batch.frame_id)
     for name in ("label", "center", "size", "rotation", "symmetry", "score", "shape"):
@@ -49,7 +50,9 @@ def test_one_replay_takes_the_place_of_another(batch, tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["replay.pt"]
 
 
-@pytest.mark.parametrize("kept", [{"batches": [{"views": 1}]}, {"batches": [3]}, {}])
+@pytest.mark.parametrize(
+    "kept", [{"batches": [{"views": 1}]}, {"batches": [3]}, {}, {"batches": [], "scale": "x"}]
+)
 def test_damaged_batches_are_one_sentence(kept, tmp_path):
     torch.save({**CARD, "state_dict": {}, "replay": kept}, tmp_path / "replay.pt")
     with pytest.raises(CheckpointError, match=r"the batches in .* are damaged"):

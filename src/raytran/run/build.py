@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from raytran.model import RayTran
 
 PRECISIONS = ("auto", "bf16-mixed", "16-mixed", "32-true")
+DETERMINISTIC = (True, False, "warn")
 
 
 def plain(node: Any) -> Any:
@@ -91,8 +92,15 @@ def build_trainer(cfg: DictConfig, run: RunConfig, card: dict[str, Any]) -> pl.T
         cfg: the root config.
         run: the same config's switches.
         card: what each checkpoint carries.
+
+    Raises:
+        ConfigError: a setting has no meaning.
     """
     settings = plain(cfg.trainer)
+    if settings["deterministic"] not in DETERMINISTIC:  # Lightning takes anything else for false
+        raise ConfigError(
+            f"unknown trainer.deterministic={settings['deterministic']}: choose true, false or warn"
+        )
     on_cpu = settings["accelerator"] == "cpu" or not torch.cuda.is_available()
     settings["precision"] = choose_precision(str(settings["precision"]), on_cpu=on_cpu)
     # Lightning counts batches here, and the configs steps.

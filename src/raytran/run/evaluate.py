@@ -25,7 +25,7 @@ from raytran.run.accuracy_figure import Curves, draw_figure, read_curves
 from raytran.run.build import build_data
 from raytran.run.checkpoint import PredictionSettings, load_model, prediction_settings
 from raytran.run.checkpoint_config import trusted_packages
-from raytran.run.device import choose_device
+from raytran.run.device import choose_device, set_matmul_precision
 from raytran.run.entry import compose
 from raytran.run.evaluate_views import FILES, evaluate_views, views_table
 from raytran.run.output import check_replaceable, replaced_folder
@@ -61,8 +61,7 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     output = Path(cfg.output)
     check_replaceable(output.resolve(), marker=MARKER)
     settings = prediction_settings(cfg.checkpoint)
-    model = load_model(cfg.checkpoint, attention=cfg.attention, trust=trusted_packages(cfg.trust))
-    model = model.to(choose_device(cfg.device))
+    model = _network(cfg)
     cfg = _in_its_preset(cfg, settings)
     # The stages before it leave the shape head untrained.
     tasks = TASKS_WITH_SHAPE if settings.stage == "shape" else TASKS
@@ -99,6 +98,14 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
 def about_data(data: SceneDataModule, split: str, num_views: int) -> dict[str, Any]:
     """Return what ``metrics.json`` says of the scenes: data set, folder, split, and frames that went in."""
     return {"dataset": data.name, "data": str(data.root), "split": split, "num_views": num_views}
+
+
+def _network(cfg: DictConfig) -> RayTran:
+    """Return the network of the checkpoint on its device."""
+    device = choose_device(cfg.device)
+    set_matmul_precision(cfg.matmul_precision, device)
+    model = load_model(cfg.checkpoint, attention=cfg.attention, trust=trusted_packages(cfg.trust))
+    return model.to(device)
 
 
 def _in_its_preset(cfg: DictConfig, settings: PredictionSettings) -> DictConfig:

@@ -20,7 +20,7 @@ from raytran.model import RayTran
 from raytran.postprocess import object_meshes
 from raytran.run.checkpoint import PredictionSettings, load_model, prediction_settings
 from raytran.run.checkpoint_config import trusted_packages
-from raytran.run.device import choose_device
+from raytran.run.device import choose_device, set_matmul_precision
 from raytran.run.output import check_replaceable
 from raytran.run.render_views import cameras_to_render, render_views
 from raytran.run.scene_files import MARKER, PredictedScene, check_pictures, write_scene
@@ -65,8 +65,10 @@ def predict(cfg: DictConfig) -> Path:
     settings = prediction_settings(cfg.checkpoint)
     if settings.stage in _UNTRAINED:
         _LOG.warning("%s is of stage %s: %s", cfg.checkpoint, settings.stage, _UNTRAINED[settings.stage])
+    device = choose_device(cfg.device)
+    set_matmul_precision(cfg.matmul_precision, device)
     model = load_model(cfg.checkpoint, attention=cfg.attention, trust=trusted_packages(cfg.trust))
-    model = model.to(choose_device(cfg.device))
+    model = model.to(device)
     _check_channels(model, cfg.checkpoint)
     new_cameras = cameras_to_render(cfg.views, model, cfg.checkpoint)
     scene_id = scene.stem if scene.is_file() else scene.name

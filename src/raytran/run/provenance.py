@@ -16,7 +16,7 @@ import torch
 import raytran
 
 _PACKAGES = (
-    "torch",
+    "triton",
     "lightning",
     "hydra-core",
     "torchmetrics",
@@ -44,6 +44,8 @@ def git_commit(package: Path | None = None) -> str | None:
 def versions() -> dict[str, str]:
     """Return the versions of Python, of this package and of those that its numbers depend on."""
     found = {"python": platform.python_version(), "raytran": raytran.__version__}
+    # The metadata of PyPI's wheel do not say which CUDA it is for.
+    found["torch"] = str(torch.__version__)
     for name in _PACKAGES:
         try:
             found[name] = metadata.version(name)

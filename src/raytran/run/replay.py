@@ -21,7 +21,7 @@ from raytran.model import RayTran, inputs_of
 from raytran.parcel import Parcel
 from raytran.run.checkpoint import model_from
 from raytran.run.checkpoint_config import trusted_packages
-from raytran.run.device import choose_device
+from raytran.run.device import choose_device, set_matmul_precision
 from raytran.training.replay_file import read_replay
 from raytran.training.stage import Stage
 from raytran.types import SceneBatch
@@ -58,19 +58,33 @@ def replay(cfg: DictConfig) -> Replayed:
         raise ConfigError(f"unknown precision={precision}: choose one of {', '.join(PRECISIONS)}")
     device = choose_device(cfg.device)
     model, loss, stage = _parts(content, path, trusted_packages(cfg.trust))
+    set_matmul_precision(content["config"].get("matmul_precision", "auto"), device)
+    scale = content["replay"].get("scale") if precision == "16-mixed" else None
     stage.freeze(model.to(device))
     stage.set_modes(model)
     found = run_step(
-        model, loss, stage, [batch.to(device) for batch in batches], autocast=PRECISIONS[precision]
+        model,
+        loss,
+        stage,
+        [batch.to(device) for batch in batches],
+        autocast=PRECISIONS[precision],
+        scale=scale or 1.0,
     )
     scenes = ", ".join(scene for batch in batches for scene in batch.scene_id)
     step = content.get("global_step")
-    _show(found, f"step {step} of stage {stage.name}, scenes {scenes}, {precision} on {device.type}")
+    scaled = "" if scale is None else f", loss times {scale:g}"
+    _show(found, f"step {step} of stage {stage.name}, scenes {scenes}, {precision} on {device.type}{scaled}")
     return found
 
 
 def run_step(
-    model: RayTran, loss: TotalLoss, stage: Stage, batches: list[SceneBatch], *, autocast: torch.dtype | None
+    model: RayTran,
+    loss: TotalLoss,
+    stage: Stage,
+    batches: list[SceneBatch],
+    *,
+    autocast: torch.dtype | None,
+    scale: float = 1.0,
 ) -> Replayed:
     """Return what a step does, forward and backward, without changing a weight.
 
@@ -80,6 +94,8 @@ def run_step(
         stage: what it is trained to do.
         batches: of the step.
         autocast: type of the forward pass under autocast, None for float32 throughout.
+        scale: what the loss is multiplied by before the backward pass. In float16 gradients overflow by the
+            scale that keeps the small ones from vanishing, long before they would without.
     """
     found = Replayed()
     with _watched(model, found.parts):
@@ -88,9 +104,9 @@ def run_step(
             with torch.autocast(device, dtype=autocast, enabled=autocast is not None):
                 raw = model(**inputs_of(batch), tasks=stage.tasks)
                 losses = loss(raw, batch, terms=stage.terms, decode_shapes=model.decode_shapes)
-            (losses["total"] / len(batches)).backward()
+            (scale * losses["total"] / len(batches)).backward()
             for name, value in losses.items():
-                found.losses[name] = found.losses.get(name, 0.0) + float(value) / len(batches)
+                found.losses[name] = found.losses.get(name, 0.0) + float(value.detach()) / len(batches)
     found.gradients += [
         name for name, p in model.named_parameters() if p.grad is not None and not p.grad.isfinite().all()
     ]

@@ -10,6 +10,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from raytran.errors import ConfigError
 from raytran.run.checkpoint_config import trusted_packages
+from raytran.run.device import check_matmul_precision
 
 PROGRESS_BARS = ("rich", "tqdm", "none")
 PARENT_CHECKS = ("scores", "stage", "none")
@@ -29,6 +30,7 @@ class RunConfig:
         check_parent: ``scores`` refuses a parent of another stage or one that has not learned its task,
             ``stage`` only the former, ``none`` nothing.
         resume: ``none``, ``auto``, or the checkpoint of an interrupted run to continue.
+        matmul_precision: of float32 products and convolutions, see ``set_matmul_precision``.
         compile: run the network through ``torch.compile``.
         checkpoint_every: optimiser steps between two writings of the last checkpoint.
         progress_bar: ``rich``, ``tqdm`` or ``none``.
@@ -43,6 +45,7 @@ class RunConfig:
     init_from: str
     check_parent: str
     resume: str
+    matmul_precision: str
     compile: bool
     checkpoint_every: int
     progress_bar: str
@@ -66,6 +69,7 @@ class RunConfig:
             raise ConfigError(
                 f"unknown progress_bar={typed.progress_bar}: choose one of {', '.join(PROGRESS_BARS)}"
             )
+        check_matmul_precision(typed.matmul_precision)
         if typed.check_parent not in PARENT_CHECKS:
             raise ConfigError(
                 f"unknown check_parent={typed.check_parent}: choose one of {', '.join(PARENT_CHECKS)}"

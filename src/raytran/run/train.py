@@ -21,6 +21,7 @@ from raytran.data.atomic import write_json, write_text
 from raytran.errors import CheckpointError, ConfigError
 from raytran.run.build import build_data, build_model, build_module, build_trainer, plain
 from raytran.run.checkpoint import checkpoint_card, load_weights, parts_afresh
+from raytran.run.device import cudnn_warning, set_matmul_precision
 from raytran.run.folders import LAST, one_at_a_time, read_finished, write_finished
 from raytran.run.known_data import KnownData
 from raytran.run.memory import explained_out_of_memory
@@ -95,12 +96,17 @@ def _train(cfg: DictConfig, run: RunConfig, folder: Path) -> FitResult:
         warnings=start.warnings,
     )
     trainer = build_trainer(cfg, run, card)
+    device = trainer.strategy.root_device
+    set_matmul_precision(run.matmul_precision, device)
     data = build_data(cfg)
     if trainer.is_global_zero:
         _describe_run(cfg, folder)
     _log.info("stage %s, %d steps, in %s", module.stage.name, trainer.max_steps, folder)
     for line in start_report(module.stage, module.model, card, trust=run.trust):
         _log.info("%s", line)
+    warning = cudnn_warning(device, str(trainer.precision))
+    if warning is not None:
+        _log.warning("%s", warning)
     began = time.monotonic()
     try:
         with explained_out_of_memory(cfg):

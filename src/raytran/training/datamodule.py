@@ -4,20 +4,30 @@
 from __future__ import annotations
 
 import logging
+import math
+import shutil
 from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
 import torch
+from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from raytran.data.augment import Augmentation
 from raytran.data.collate import collate_scenes
+from raytran.parcel import Parcel
 from raytran.training.scene_stream import SceneStream
 from raytran.types import SceneBatch
 
 _log = logging.getLogger(__name__)
+
+SHARED_MEMORY = Path("/dev/shm")
+"""Where loader workers of Linux leave the tensors that they hand over."""
+
+_PREFETCHED = 2
+"""Batches that a worker loads ahead."""
 
 
 class SceneDataModule(pl.LightningDataModule):
@@ -106,6 +116,7 @@ class SceneDataModule(pl.LightningDataModule):
             seed=self._seed,
             first=self._place["scenes"],
         )
+        self._check_shared_memory(dataset)
         return self._loader(dataset, stream, self._batch_size)
 
     def val_dataloader(self) -> DataLoader[SceneBatch]:
@@ -124,6 +135,7 @@ class SceneDataModule(pl.LightningDataModule):
             batch_size=batch_size,
             sampler=sampler,
             num_workers=self._num_workers,
+            prefetch_factor=_PREFETCHED if self._num_workers else None,
             persistent_workers=self._num_workers > 0,
             collate_fn=collate_scenes,
             pin_memory=self.trainer is not None and self.trainer.strategy.root_device.type == "cuda",
@@ -132,7 +144,34 @@ class SceneDataModule(pl.LightningDataModule):
             generator=torch.Generator().manual_seed(self._seed),
         )
 
+    def _check_shared_memory(self, dataset: Dataset[SceneBatch]) -> None:
+        """Warn where the workers of this machine may load more than its shared memory holds.
+
+        During a validation the workers of the training scenes hold what they have loaded ahead as well.
+        """
+        trainer = self.trainer
+        if trainer is None or trainer.local_rank or not self._num_workers or not SHARED_MEMORY.is_dir():
+            return
+        scenes = trainer.num_devices * self._num_workers * _PREFETCHED * (self._batch_size + 1)
+        needed, free = scenes * _bytes_of(dataset[0]), shutil.disk_usage(SHARED_MEMORY).free
+        if needed > free:
+            _log.warning(
+                "loader workers may hold %d scenes, %.2g GB, in %s, which has %.2g GB free; where it is full "
+                "they die of a bus error, or training waits for a scene that never comes: enlarge it (docker "
+                "run --shm-size=%dg, or --ipc=host) or set fewer views.num_workers (0: none)",
+                *(scenes, needed / 1e9, SHARED_MEMORY, free / 1e9, math.ceil(needed / 1e9) + 1),
+            )
+
     def _ranks(self) -> dict[str, Any]:
         if self.trainer is None:
             return {"num_replicas": 1, "rank": 0}
         return {"num_replicas": self.trainer.world_size, "rank": self.trainer.global_rank}
+
+
+def _bytes_of(value: Any) -> int:
+    """Return the size of all tensors in a batch."""
+    if isinstance(value, Tensor):
+        return value.nbytes
+    if isinstance(value, Parcel):
+        return sum(_bytes_of(item) for item in vars(value).values())
+    return sum(map(_bytes_of, value)) if isinstance(value, tuple) else 0

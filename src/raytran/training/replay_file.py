@@ -23,6 +23,7 @@ def write_replay(
     card: Mapping[str, Any],
     step: int,
     precision: str,
+    scale: float | None,
 ) -> None:
     """Write weights and batches of one step.
 
@@ -33,13 +34,14 @@ def write_replay(
         card: what every checkpoint of the run carries.
         step: number of the step.
         precision: Lightning's name of it.
+        scale: what the loss was multiplied by before the backward pass; None without a loss scaler.
 
     Raises:
         CheckpointError: the file cannot be written.
     """
     path.unlink(missing_ok=True)
     state = {f"model.{name}": value.cpu() for name, value in model.state_dict().items()}
-    kept = {"precision": precision, "batches": [_plain(batch.to("cpu")) for batch in batches]}
+    kept = {"precision": precision, "scale": scale, "batches": [_plain(batch.to("cpu")) for batch in batches]}
     write_checkpoint(path, {**card, "state_dict": state, "global_step": step, "replay": kept})
 
 
@@ -57,8 +59,9 @@ def read_replay(path: Path) -> tuple[dict[str, Any], list[SceneBatch]]:
             "because its numbers were not finite"
         )
     try:
+        float(kept.get("scale") or 1.0)
         return content, [_batch(plain) for plain in kept["batches"]]
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise CheckpointError(f"the batches in {path} are damaged: take another copy of the file") from error
 
 

@@ -8,6 +8,7 @@ import math
 import lightning.pytorch as pl
 import pytest
 import torch
+from lightning.pytorch.plugins import MixedPrecision
 
 from raytran.errors import NonFiniteError
 from raytran.training.callbacks.health import Health
@@ -99,6 +100,7 @@ def test_a_run_gives_up_and_keeps_its_last_batches(fit, make_module, batch, tmp_
     content, batches = read_replay(path)
     assert content["global_step"] == 3
     assert (content["stage"], content["replay"]["precision"]) == ("joint", "32-true")
+    assert content["replay"]["scale"] is None
     assert torch.equal(batches[0].views.images, batch.views.images)
     assert torch.equal(batches[0].objects[0].shape, batch.objects[0].shape)
     assert batches[0].frame_id == batch.frame_id
@@ -139,7 +141,25 @@ def test_signals_are_logged_where_the_losses_are(fit, tmp_path):
 def test_half_precision_too(precision, fit, make_module, tmp_path):
     health, states = Health(tmp_path / "replay.pt", max_skipped=3, card=CARD), States()
     module = overflow(make_module("stage1"), 2, 2)
-    trainer = fit(health, states, module=module, max_steps=3, precision=precision, gradient_clip_val=0.1)
+    # By name, the Trainer takes 16-mixed for bf16-mixed on a CPU. The scale is one that does not overflow.
+    scaler = torch.amp.GradScaler("cpu", init_scale=256.0) if precision == "16-mixed" else None
+    half = MixedPrecision(precision, "cpu", scaler)
+    trainer = fit(health, states, module=module, max_steps=3, plugins=[half], gradient_clip_val=0.1)
     assert same(states.seen[0], states.seen[1])
     assert math.isfinite(trainer.logged_metrics["train/total"])
     assert trainer.logged_metrics["health/skipped_steps"] >= 1
+
+
+def test_a_replay_knows_the_scale_of_the_loss(fit, make_module, tmp_path):
+    scales = []
+
+    class Scale(pl.Callback):
+        def on_before_backward(self, trainer, module, loss):
+            scales.append(trainer.precision_plugin.scaler.get_scale())
+
+    module = overflow(make_module("stage1"), 1, 99)
+    health = Health(tmp_path / "replay.pt", max_skipped=2, card=CARD)
+    with pytest.raises(NonFiniteError):
+        fit(Scale(), health, module=module, max_steps=3, plugins=[MixedPrecision("16-mixed", "cpu")])
+    content, _ = read_replay(tmp_path / "replay.pt")
+    assert content["replay"]["scale"] == scales[-1] > 1

@@ -140,6 +140,7 @@ class Health(pl.Callback):
                 card=self._card,
                 step=step,
                 precision=str(trainer.precision),
+                scale=_loss_scale(trainer),
             )
         except CheckpointError as error:
             hint = str(error)
@@ -152,6 +153,12 @@ class Health(pl.Callback):
             f"{self._in_a_row} steps in a row were not finite, the last one step {step} ({reason}): lower "
             f"optimizer.learning_rate,{remedy} and go on from a checkpoint before that; {hint}"
         )
+
+
+def _loss_scale(trainer: pl.Trainer) -> float | None:
+    """Return what the loss of this step was multiplied by, None in other precisions than 16-mixed."""
+    scaler = getattr(trainer.precision_plugin, "scaler", None)
+    return None if scaler is None else float(scaler.get_scale())
 
 
 def _not_finite(module: Reconstruction, loss: float, norms: Mapping[str, float]) -> str:
