@@ -13,8 +13,8 @@ import statistics
 import tempfile
 import time
 import warnings
-from collections.abc import Callable, Collection, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -88,7 +88,6 @@ def run_steps(
         warm_up: steps before.
         clock: seconds; every step waits for the device once, so that the host's clock does.
     """
-    _quiet()
     held = device.held()
     torch.manual_seed(cfg.seed)
     with tempfile.TemporaryDirectory() as folder:
@@ -104,7 +103,7 @@ def run_steps(
         if device.torch_device.type != "cpu":
             batch = batch.pin_memory()  # as the loader of a run does
         scenes: list[Any] = [batch] * cfg.trainer.max_steps
-        with device.counting():
+        with _quiet(), device.counting():
             trainer.fit(module, DataLoader(scenes, batch_size=None))
     return Steps(
         seconds=statistics.median(watch.seconds) if watch.seconds else math.nan,
@@ -187,8 +186,18 @@ def random_batch(
     )
 
 
-def _quiet() -> None:
+@contextmanager
+def _quiet() -> Iterator[None]:
     """Silence what is said of a run that is no real one."""
-    for name in ("raytran", "lightning.pytorch", "lightning.fabric", "lightning.pytorch.utilities.rank_zero"):
-        logging.getLogger(name).setLevel(logging.ERROR)
-    warnings.filterwarnings("ignore", module=r"lightning\.")
+    names = ("raytran", "lightning.pytorch", "lightning.fabric", "lightning.pytorch.utilities.rank_zero")
+    loggers = [logging.getLogger(name) for name in names]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", module=r"lightning\.")
+            yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)

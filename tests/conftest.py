@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import logging
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -28,6 +30,18 @@ def shared_dir() -> Path:
     if not (folder / "realdata").is_dir():
         pytest.skip(f"reference data not found at {folder / 'realdata'}")
     return folder
+
+
+@pytest.fixture(autouse=True)
+def log_levels_are_left_alone() -> Iterator[None]:
+    """What one test silences, others would wait for in vain."""
+    log = logging.getLogger("raytran")
+    before = log.level, log.disabled
+    yield
+    after = log.level, log.disabled
+    log.setLevel(before[0])
+    log.disabled = before[1]
+    assert after == before, "the test leaves the logger of raytran changed"
 
 
 @pytest.fixture
