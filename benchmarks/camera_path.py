@@ -10,7 +10,7 @@ import torch
 
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.run.camera_paths import recorded, walk
+from raytran.run.plan.camera_paths import recorded, walk
 
 FEATURE_SIZE = (30, 40)
 PAPER_GRID = (48, 48, 16)

@@ -28,10 +28,10 @@ from raytran.data.dataset import TARGETS
 from raytran.geometry.camera import Cameras
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.model import RayTran
-from raytran.run.build import build_model, build_module, build_trainer, plain
 from raytran.run.entry import compose
-from raytran.run.settings import RunConfig
-from raytran.types import SHAPE_SIZE, ObjectSet, SceneBatch, Views
+from raytran.run.train.build import build_model, build_module, build_trainer, plain
+from raytran.run.train.settings import RunConfig
+from raytran.structs import SHAPE_SIZE, ObjectSet, SceneBatch, Views
 
 WARM_UP = 5
 """Steps before anything is measured."""

@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from raytran.data.scan2cad import read_annotations, scene_objects
-from raytran.data.scannet import read_scan
+from raytran.data.scannet.scan import read_scan
 from raytran.data.scene_list import read_split
 from raytran.export.scene_json import write_scene_json
 from raytran.geometry.rotation import rotation_from_yaw, yaw_from_rotation
-from raytran.types import ObjectSet, ScenePrediction
+from raytran.structs import ObjectSet, ScenePrediction
 
 CELL = 0.4
 """Side of the cells in which places are counted, metres: right to 20 cm in the middle of its cell."""

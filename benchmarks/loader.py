@@ -26,12 +26,12 @@ from raytran.data.augment import Augmentation
 from raytran.data.cache import MaskCache
 from raytran.data.collate import collate_scenes
 from raytran.data.dataset import SceneDataset, scan2cad_dataset
-from raytran.data.rooms.generate import generate_rooms
-from raytran.data.scannet import read_scan, scan_views
+from raytran.data.scannet.scan import read_scan, scan_views
 from raytran.data.targets import foreground_masks, scene_occupancy, shape_grids
 from raytran.data.views import choose_even
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
+from raytran.rooms.generate import generate_rooms
 
 IMAGE_SIZE = (480, 640)
 NUM_VIEWS = 20

@@ -21,12 +21,12 @@ from step import load_of
 from timing import MEBIBYTE, print_machine, reason
 
 from raytran.geometry.camera import Cameras
-from raytran.ops.ray_tracer import RayTracer
-from raytran.run.build import build_model
+from raytran.ops.tracer import RayTracer
 from raytran.run.entry import compose
-from raytran.run.forecast import prediction_bytes
-from raytran.run.plan import FIXED, SCRATCH
-from raytran.types import Views
+from raytran.run.plan.forecast import prediction_bytes
+from raytran.run.plan.plan import FIXED, SCRATCH
+from raytran.run.train.build import build_model
+from raytran.structs import Views
 
 
 def predict_once(

@@ -28,12 +28,12 @@ from torch import Tensor
 
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.ops.block_pairs import BlockPairs
-from raytran.ops.fused import listed
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_attention import Direction, ray_attention
-from raytran.ops.ray_tracer import RayTracer
-from raytran.run.ceilings import measure_ceilings
+from raytran.ops.tracer import RayTracer
+from raytran.ops.triton.block_pairs import BlockPairs
+from raytran.ops.triton.dispatch import listed
+from raytran.run.plan.ceilings import measure_ceilings
 
 HEADS, CHANNELS = 8, 32
 RAYS_PER_CELL = 2

@@ -35,16 +35,16 @@ from torch import Tensor
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.model import RayTran
-from raytran.ops.fused import listed
-from raytran.ops.ray_tracer import RayTracer
+from raytran.ops.tracer import RayTracer
 from raytran.ops.traverse import trace_pairs
-from raytran.run.build import build_model, choose_precision
-from raytran.run.ceilings import Ceilings, measure_ceilings
-from raytran.run.forecast import Load, training_bytes, work_of_parts
-from raytran.run.plan import FIXED, SCRATCH
-from raytran.run.step_parts import Part, step_parts
+from raytran.ops.triton.dispatch import listed
+from raytran.run.plan.ceilings import Ceilings, measure_ceilings
+from raytran.run.plan.forecast import Load, training_bytes, work_of_parts
+from raytran.run.plan.plan import FIXED, SCRATCH
+from raytran.run.plan.step_parts import Part, step_parts
+from raytran.run.train.build import build_model, choose_precision
+from raytran.structs import Views
 from raytran.training.stage import Stage
-from raytran.types import Views
 
 Clock = Callable[[], float] | None
 """Seconds; None is the wall clock, which waits for a GPU."""

@@ -12,9 +12,9 @@ from record import write_rows
 from timing import MEBIBYTE, Run, measure, print_machine
 
 from raytran.geometry.camera import Cameras
-from raytran.ops.fused import listed
 from raytran.ops.pairs import PairList
-from raytran.ops.ray_tracer import RayTracer
+from raytran.ops.tracer import RayTracer
+from raytran.ops.triton.dispatch import listed
 
 
 def tracers(

@@ -21,8 +21,8 @@ from torch import Tensor
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.ops.ray_attention import ray_attention
-from raytran.ops.ray_tracer import RayTracer
 from raytran.ops.splat import splat_features
+from raytran.ops.tracer import RayTracer
 
 HEADS, CHANNELS = 8, 256
 

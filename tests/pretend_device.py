@@ -155,7 +155,7 @@ def kernels_left_out() -> Iterator[None]:
 
     Attention and splatting give zeros; the pairs of the same cameras are traced once.
     """
-    from raytran.ops import trace_blocks
+    from raytran.ops.triton import traverse as trace_blocks
 
     trace = trace_blocks.trace_blocks
 

@@ -11,11 +11,11 @@ import pytest
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
-from raytran.data.rooms.generate import generate_rooms
 from raytran.errors import ConfigError
-from raytran.run.build import build_model, plain
+from raytran.rooms.generate import generate_rooms
 from raytran.run.entry import compose
-from raytran.run.settings import RunConfig
+from raytran.run.train.build import build_model, plain
+from raytran.run.train.settings import RunConfig
 
 EXPERIMENTS = ("stage1", "stage2", "stage3")
 PRESETS = ("raytran", "small", "laptop", "tiny")
@@ -25,8 +25,8 @@ GIVEN_BY_CODE = {
     "raytran.data.dataset.scan2cad_dataset": {
         *("root", "split", "num_views", "view_choice", "targets", "augmentation"),
     },
-    "raytran.run.rooms.ensure_rooms": {"output"},
-    "raytran.run.rooms.ensure_rooms_v1": {"output"},
+    "raytran.rooms.ensure.ensure_rooms": {"output"},
+    "raytran.rooms.ensure.ensure_rooms_v1": {"output"},
 }
 # Part of the layout that scan2cad_dataset stands for.
 FIXED_BY_LAYOUT = {"scans_root", "scene_ids", "annotations", "shapenet_root"}
@@ -67,7 +67,7 @@ def arguments(path):
         passed_on = dict(inspect.signature(locate("raytran.data.dataset.SceneDataset")).parameters)
         parameters |= {name: value for name, value in passed_on.items() if name not in FIXED_BY_LAYOUT}
         del parameters["options"]
-    if path == "raytran.run.rooms.ensure_rooms":
+    if path == "raytran.rooms.ensure.ensure_rooms":
         parameters = dict(inspect.signature(generate_rooms).parameters)
     return parameters
 

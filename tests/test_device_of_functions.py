@@ -14,6 +14,7 @@ from raytran.geometry.boxes import OrientedBoxes, box_iou
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.position import position_code, ray_code
+from raytran.geometry.rasterize import rasterize_mask
 from raytran.geometry.rotation import (
     geodesic_angle,
     matrix_from_quaternion,
@@ -31,15 +32,14 @@ from raytran.metrics.functional.shape import chamfer_distance, surface_points
 from raytran.metrics.image import psnr_of_frames
 from raytran.metrics.new_views import nearest_frames
 from raytran.ops import reference
-from raytran.ops.attention_weights import attention_weights
 from raytran.ops.center_tracer import pair_centers
 from raytran.ops.pairs import PairList
-from raytran.ops.rasterize import rasterize_mask
 from raytran.ops.ray_attention import ray_attention
 from raytran.ops.splat import splat_features
 from raytran.ops.traverse import count_views, trace_pairs
 from raytran.postprocess import count_object_views, merge_volumes, object_meshes, select_objects
-from raytran.types import ObjectSet, ScenePrediction
+from raytran.structs import ObjectSet, ScenePrediction
+from raytran.viewer.attention_weights import attention_weights
 
 from .pretend_device import DEVICE, on_pretend_device, recorded
 

@@ -18,31 +18,31 @@ import torch.distributed as dist
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from raytran.data.camera_list import CameraList
+from raytran.capture.camera_list import CameraList
+from raytran.capture.lens import Lens
+from raytran.checkpoints.checkpoint import checkpoint_card
+from raytran.checkpoints.file import read_checkpoint
+from raytran.checkpoints.runs import LAST
 from raytran.data.collate import collate_scenes
-from raytran.data.importers.lens import Lens
 from raytran.errors import NonFiniteError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.geometry.volumes import Volumes
-from raytran.ops import block_pairs
-from raytran.ops.ray_tracer import RayTracer
-from raytran.run.build import build_model, build_module, build_trainer, plain
-from raytran.run.checkpoint import checkpoint_card
+from raytran.ops.tracer import RayTracer
+from raytran.ops.triton import block_pairs
 from raytran.run.entry import compose
-from raytran.run.evaluate import TASKS_WITH_SHAPE, evaluate_model
-from raytran.run.evaluate_views import evaluate_views
-from raytran.run.folders import LAST
-from raytran.run.predict import predict_scene
-from raytran.run.render_views import render_views
+from raytran.run.evaluate.evaluate import TASKS_WITH_SHAPE, evaluate_model
+from raytran.run.evaluate.views import evaluate_views
+from raytran.run.predict.predict import predict_scene
+from raytran.run.predict.render import render_views
+from raytran.run.predict.room import RoomViews, predict_room
 from raytran.run.replay import run_step
-from raytran.run.settings import RunConfig
-from raytran.run.volumes import RoomViews, predict_room
-from raytran.training.checkpoint_file import read_checkpoint
+from raytran.run.train.build import build_model, build_module, build_trainer, plain
+from raytran.run.train.settings import RunConfig
+from raytran.structs import SHAPE_SIZE, ObjectSet, SceneBatch, ScenePrediction, Views
 from raytran.training.ranks import agree
 from raytran.training.replay_file import read_replay
 from raytran.training.scores import SceneScores
-from raytran.types import SHAPE_SIZE, ObjectSet, SceneBatch, ScenePrediction, Views
 
 from .pretend_accelerator import register_with_lightning
 from .pretend_device import DEVICE, NAME, kernels_left_out, on_pretend_device, recorded

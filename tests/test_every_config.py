@@ -13,9 +13,9 @@ from hydra import initialize_config_dir
 from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf
 
-from raytran.run.build import build_data, build_model, build_module, plain
 from raytran.run.config_dir import config_dir
 from raytran.run.entry import compose
+from raytran.run.train.build import build_data, build_model, build_module, plain
 
 CONF = config_dir()
 FILES = sorted(path.relative_to(CONF).with_suffix("") for path in CONF.rglob("*.yaml"))

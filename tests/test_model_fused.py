@@ -11,10 +11,10 @@ from raytran.backbone.resnet import ResNet18
 from raytran.heads.foreground import ForegroundHead
 from raytran.heads.occupancy import OccupancyHead
 from raytran.model import RayTran
-from raytran.ops import block_pairs
-from raytran.ops.block_pairs import BlockPairs
-from raytran.ops.ray_tracer import RayTracer
-from raytran.types import RawScene, Views
+from raytran.ops.tracer import RayTracer
+from raytran.ops.triton import block_pairs
+from raytran.ops.triton.block_pairs import BlockPairs
+from raytran.structs import RawScene, Views
 
 pytest.importorskip("triton", reason="Triton is not installed: the fused kernels have nothing to run on")
 

@@ -10,7 +10,7 @@ import torch
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.geometry.volumes import Volumes
 from raytran.postprocess import count_object_views, merge_volumes, object_meshes, select_objects
-from raytran.types import ObjectSet, ScenePrediction
+from raytran.structs import ObjectSet, ScenePrediction
 
 SIZE = 16
 TWO = Volumes(

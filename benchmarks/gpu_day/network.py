@@ -15,12 +15,12 @@ from torch import Tensor
 
 from gpu_day.context import Context
 from raytran.model import inputs_of
-from raytran.ops.fused import Attention
-from raytran.ops.ray_tracer import RayTracer
-from raytran.run.build import build_model, build_module
-from raytran.run.camera_paths import walk
+from raytran.ops.tracer import RayTracer
+from raytran.ops.triton.dispatch import Attention
+from raytran.run.plan.camera_paths import walk
+from raytran.run.train.build import build_model, build_module
+from raytran.structs import SceneBatch
 from raytran.training.reconstruction import Reconstruction
-from raytran.types import SceneBatch
 
 LOSS_TOLERANCE = 1e-4
 """Of each loss term, over its size. Weights changed in their last bit change losses by 3e-7 at most (four

@@ -15,7 +15,7 @@ import torch
 from device import Device
 
 from gpu_day.context import Sizes
-from raytran.ops import block_pairs
+from raytran.ops.triton import block_pairs
 
 # Tests import each other from the package that pytest makes of their folder.
 sys.modules["tests"] = types.ModuleType("tests")

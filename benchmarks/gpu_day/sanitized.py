@@ -13,9 +13,9 @@ from camera_path import paper_grid
 
 from raytran.geometry.camera import Cameras
 from raytran.ops.ray_attention import ray_attention
-from raytran.ops.ray_tracer import RayTracer
 from raytran.ops.splat import splat_features
-from raytran.run.camera_paths import walk
+from raytran.ops.tracer import RayTracer
+from raytran.run.plan.camera_paths import walk
 
 
 def main(device: str = "cuda") -> None:

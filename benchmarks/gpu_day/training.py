@@ -18,11 +18,11 @@ from pathlib import Path
 import torch
 
 from gpu_day.context import Context
-from raytran.run.build import build_data
+from raytran.checkpoints.file import read_newest
+from raytran.checkpoints.runs import LAST, read_finished
 from raytran.run.entry import compose, quoted
-from raytran.run.folders import LAST, read_finished
-from raytran.run.loggers import read_history
-from raytran.training.checkpoint_file import read_newest
+from raytran.run.train.build import build_data
+from raytran.run.train.loggers import read_history
 
 STAGES = ("stage1", "stage2", "stage3")
 

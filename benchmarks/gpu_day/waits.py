@@ -13,7 +13,7 @@ from pathlib import Path
 from fit import run_steps, step_config
 
 from gpu_day.context import Context
-from raytran.run.camera_paths import walk
+from raytran.run.plan.camera_paths import walk
 
 PRESET = "raytran"
 

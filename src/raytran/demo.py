@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 def main(cfg: DictConfig) -> None:
     """Run the command."""
     # Imported here so that --help answers at once.
-    from raytran.run.demo import demo
+    from raytran.run.demo.demo import demo
 
     demo(cfg)
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 def main(cfg: DictConfig) -> None:
     """Run the command."""
     # Imported here so that --help answers at once.
-    from raytran.run.evaluate import evaluate
+    from raytran.run.evaluate.evaluate import evaluate
 
     evaluate(cfg)
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 def main(cfg: DictConfig) -> None:
     """Run the command."""
     # Imported here so that --help answers at once.
-    from raytran.run.export_model import export_model
+    from raytran.run.export.export_model import export_model
 
     export_model(cfg)
 

@@ -22,12 +22,12 @@ from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.heads.objects import ObjectHead
 from raytran.heads.slots import objects_of_slots
-from raytran.ops.block_pairs import BlockPairs
-from raytran.ops.fused import Attention
 from raytran.ops.pairs import PairList
-from raytran.ops.ray_tracer import RayTracer
+from raytran.ops.tracer import RayTracer
 from raytran.ops.traverse import count_views
-from raytran.types import ObjectSet, RawScene, SceneBatch, ScenePrediction, Views
+from raytran.ops.triton.block_pairs import BlockPairs
+from raytran.ops.triton.dispatch import Attention
+from raytran.structs import ObjectSet, RawScene, SceneBatch, ScenePrediction, Views
 
 TASKS = ("occupancy", "foreground", "objects")
 """What ``forward`` is asked for by default; shapes are decoded afterwards, for chosen queries only."""

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 def main(cfg: DictConfig) -> None:
     """Run the command."""
     # Imported here so that --help answers at once.
-    from raytran.run.plan import plan
+    from raytran.run.plan.plan import plan
 
     plan(cfg)
 

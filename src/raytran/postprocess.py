@@ -17,7 +17,7 @@ from torch import Tensor
 from raytran.geometry.boxes import OrientedBoxes, box_iou
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.volumes import Volumes
-from raytran.types import ObjectSet, ScenePrediction
+from raytran.structs import ObjectSet, ScenePrediction
 
 _POINTS_PER_SIDE = 4
 """A box is sampled at so many points along each side to see how many views saw it."""

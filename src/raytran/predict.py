@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 def main(cfg: DictConfig) -> None:
     """Run the command."""
     # Imported here so that --help answers at once.
-    from raytran.run.predict import predict
+    from raytran.run.predict.predict import predict
 
     predict(cfg)
 

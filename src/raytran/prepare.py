@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 def main(cfg: DictConfig) -> None:
     """Run the command."""
     # Imported here so that --help answers at once.
-    from raytran.run.prepare import prepare
+    from raytran.run.prepare.prepare import prepare
 
     prepare(cfg)
 

@@ -19,8 +19,8 @@ from gpu_day.report import Part, write_report
 from gpu_day.training import compare_ranks
 from torch.utils import backend_registration
 
-from raytran.run.build import build_model
-from raytran.run.camera_paths import walk
+from raytran.run.plan.camera_paths import walk
+from raytran.run.train.build import build_model
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 SCRIPT = BENCHMARKS / "gpu_day.py"
@@ -255,6 +255,6 @@ def test_a_random_scene_can_be_put_into_page_locked_memory():
         assert tensor.is_contiguous()
         return tensor
 
-    parcels = [batch, batch.views, *batch.objects]
-    for parcel in parcels:
-        parcel._map(lambda item: check(item) if isinstance(item, torch.Tensor) else item)
+    structs = [batch, batch.views, *batch.objects]
+    for struct in structs:
+        struct._map(lambda item: check(item) if isinstance(item, torch.Tensor) else item)

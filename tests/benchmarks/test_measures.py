@@ -20,8 +20,8 @@ from fit import random_batch, run_steps, step_config
 from timing import measure, reason
 
 from raytran.geometry.grid import VoxelGrid
-from raytran.run.build import build_model, build_module
-from raytran.run.camera_paths import walk
+from raytran.run.plan.camera_paths import walk
+from raytran.run.train.build import build_model, build_module
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 SMALL = [

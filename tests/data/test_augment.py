@@ -13,15 +13,15 @@ import torch
 
 from raytran.data.augment import Augmentation, change_colors, color_change, mirror_scene, turn_scene
 from raytran.data.dataset import scan2cad_dataset
-from raytran.data.shapenet import read_mesh
+from raytran.data.shapenet.models import read_mesh
+from raytran.data.shapenet.voxelize import voxelize_solid
 from raytran.data.targets import scene_occupancy
-from raytran.data.voxelize import voxelize_solid
 from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
+from raytran.geometry.rasterize import rasterize_mask
 from raytran.geometry.rotation import rotation_from_yaw, yaw_from_rotation
-from raytran.ops.rasterize import rasterize_mask
-from raytran.types import SHAPE_SIZE, ObjectSet, SceneBatch, Views
+from raytran.structs import SHAPE_SIZE, ObjectSet, SceneBatch, Views
 
 SIZE = (48, 64)
 # A corner of the cube [-½, ½]³: no mirror and no turn maps it to itself.

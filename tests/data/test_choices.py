@@ -18,7 +18,7 @@ from raytran.data.targets import STANDS_OFF, foreground_masks, seen_objects, vis
 from raytran.errors import ConfigError, DataError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.types import ObjectSet
+from raytran.structs import ObjectSet
 
 SMALL = {"image_size": (32, 48), "num_views": 2, "grid_resolution": (8, 8, 4), "grid_extent": (8.0, 8.0, 4.0)}
 """Frames 10 and 100, chosen evenly, look along +x from x = 0.1 and 1 at a height of 1 m."""

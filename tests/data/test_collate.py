@@ -8,7 +8,7 @@ import torch
 
 from raytran.data.collate import collate_scenes
 from raytran.errors import ShapeError
-from raytran.types import ObjectSet, SceneBatch, Views
+from raytran.structs import ObjectSet, SceneBatch, Views
 
 
 def sample(name: str, value: float, num_views: int = 2, targets: bool = True) -> SceneBatch:

@@ -17,11 +17,11 @@ from raytran.data import dataset as dataset_module
 from raytran.data.augment import Augmentation
 from raytran.data.collate import collate_scenes
 from raytran.data.dataset import SceneDataset, scan2cad_dataset
-from raytran.data.scannet import load_views
+from raytran.data.scannet.scan import load_views
 from raytran.errors import ConfigError, DataError
 from raytran.geometry.rotation import yaw_from_rotation
+from raytran.structs import SHAPE_SIZE
 from raytran.training.datamodule import SceneDataModule
-from raytran.types import SHAPE_SIZE
 
 SMALL = {"image_size": (32, 48), "num_views": 2, "grid_resolution": (8, 8, 4), "grid_extent": (8.0, 8.0, 4.0)}
 

@@ -13,7 +13,7 @@ from PIL import Image
 from raytran.data.images import decode_image, read_image, read_images, resize, stored_size
 from raytran.errors import DataError
 
-from .scan_forms import write_claiming_png
+from ..scan_forms import write_claiming_png
 
 
 @pytest.fixture

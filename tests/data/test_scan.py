@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from raytran.data.scannet import open_scan, read_scan, read_sens
+from raytran.data.scannet.scan import open_scan, read_scan, read_sens
 from raytran.errors import DataError
 
 

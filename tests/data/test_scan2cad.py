@@ -18,7 +18,7 @@ from raytran.geometry.rotation import (
     rotation_from_yaw,
     yaw_from_rotation,
 )
-from raytran.types import CLASSES, SYMMETRY_INFINITE
+from raytran.structs import CLASSES, SYMMETRY_INFINITE
 
 
 def objects_of(path, scene_id="scene0000_00"):

@@ -12,7 +12,7 @@ from raytran.data import scene_list
 from raytran.data.scan2cad import read_annotations, scene_objects
 from raytran.data.scene_list import ObjectTable, RecentScans, choose_scenes
 from raytran.errors import DataError
-from raytran.types import ObjectSet
+from raytran.structs import ObjectSet
 
 
 @pytest.fixture

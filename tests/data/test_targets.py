@@ -17,16 +17,16 @@ from scipy.spatial.transform import Rotation
 from raytran.data import targets
 from raytran.data.cache import MaskCache
 from raytran.data.scan2cad import read_annotations, scene_objects
-from raytran.data.scannet import read_scan
-from raytran.data.shapenet import read_mesh
-from raytran.data.shapenet_binvox import read_binvox
+from raytran.data.scannet.scan import read_scan
+from raytran.data.shapenet.binvox import read_binvox
+from raytran.data.shapenet.models import read_mesh
+from raytran.data.shapenet.voxelize import voxelize_solid
 from raytran.data.targets import foreground_masks, scene_occupancy, shape_grids
-from raytran.data.voxelize import voxelize_solid
 from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.types import SHAPE_SIZE, ObjectSet
+from raytran.structs import SHAPE_SIZE, ObjectSet
 
 
 def box(center, size, yaw=0.0, shape_size=4, model_id="03001627/cube") -> ObjectSet:

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from raytran.data.rooms.generate import generate_rooms
+from raytran.rooms.generate import generate_rooms
 
 
 @pytest.fixture(scope="session")

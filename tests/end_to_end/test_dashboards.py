@@ -11,8 +11,8 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from raytran.run.entry import compose
-from raytran.run.loggers import WANDB_ID, read_history
-from raytran.run.train import train
+from raytran.run.train.fit import train
+from raytran.run.train.loggers import WANDB_ID, read_history
 
 STEPS = (2, 4)
 PICTURES = {"masks", "occupancy", "topdown", "boxes"}

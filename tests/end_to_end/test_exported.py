@@ -9,14 +9,14 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from raytran.checkpoints.file import read_checkpoint
+from raytran.checkpoints.runs import LAST
 from raytran.errors import CheckpointError
 from raytran.run.entry import compose
-from raytran.run.evaluate import evaluate
-from raytran.run.export_model import export_model
-from raytran.run.folders import LAST
-from raytran.run.predict import predict
-from raytran.run.train import train
-from raytran.training.checkpoint_file import read_checkpoint
+from raytran.run.evaluate.evaluate import evaluate
+from raytran.run.export.export_model import export_model
+from raytran.run.predict.predict import predict
+from raytran.run.train.fit import train
 
 STEPS = ["trainer.max_steps=1", "trainer.val_check_interval=1"]
 
@@ -56,7 +56,7 @@ def test_weights_are_no_run_to_resume(settings, weights, tmp_path):
 def test_evaluate_takes_weights(settings, weights, tmp_path, monkeypatch):
     words = [*settings[:2], f"checkpoint={weights}", f"output={tmp_path / 'results'}"]
     typed = SimpleNamespace(overrides=SimpleNamespace(task=words))
-    monkeypatch.setattr("raytran.run.evaluate.HydraConfig", SimpleNamespace(get=lambda: typed))
+    monkeypatch.setattr("raytran.run.evaluate.evaluate.HydraConfig", SimpleNamespace(get=lambda: typed))
     assert evaluate(compose("evaluate", words))["checkpoint"] == str(weights)
     assert json.loads((tmp_path / "results" / "metrics.json").read_text())["strict"]["n_scenes"] == 1
 

@@ -7,12 +7,12 @@ import pytest
 import torch
 from omegaconf import OmegaConf
 
+from raytran.checkpoints.file import read_checkpoint
+from raytran.checkpoints.runs import LAST
 from raytran.errors import CheckpointError, ConfigError
-from raytran.run.build import build_model, plain
 from raytran.run.entry import compose
-from raytran.run.folders import LAST
 from raytran.run.replay import _parts, replay
-from raytran.training.checkpoint_file import read_checkpoint
+from raytran.run.train.build import build_model, plain
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from raytran.run.folders import FINISHED, LAST
-from raytran.training.checkpoint_file import read_newest
+from raytran.checkpoints.file import read_newest
+from raytran.checkpoints.runs import FINISHED, LAST
 
 pytestmark = pytest.mark.slow
 

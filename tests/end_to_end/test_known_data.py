@@ -9,11 +9,11 @@ import shutil
 import pytest
 import torch
 
+from raytran.checkpoints.runs import read_finished
 from raytran.data.scan2cad import annotation_digest, annotation_path
 from raytran.errors import ConfigError
 from raytran.run.entry import compose
-from raytran.run.folders import read_finished
-from raytran.run.train import train
+from raytran.run.train.fit import train
 
 REPEATED = "scans have 6 frames, fewer than the 8 asked for: frames are repeated"
 

@@ -12,13 +12,13 @@ import torch
 from PIL import Image
 
 import raytran
-from raytran.data.scannet import open_scan
+from raytran.data.scannet.scan import open_scan
 from raytran.errors import ConfigError
-from raytran.run.build import build_data
 from raytran.run.entry import compose
-from raytran.run.evaluate_views import evaluate_views
-from raytran.run.predict import predict
-from raytran.run.train import train
+from raytran.run.evaluate.views import evaluate_views
+from raytran.run.predict.predict import predict
+from raytran.run.train.build import build_data
+from raytran.run.train.fit import train
 
 
 @pytest.fixture(scope="module")

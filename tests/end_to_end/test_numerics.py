@@ -13,7 +13,7 @@ import torch
 
 from raytran.errors import ConfigError
 from raytran.run.entry import compose
-from raytran.run.train import train
+from raytran.run.train.fit import train
 from raytran.training import datamodule
 from raytran.training.reconstruction import Reconstruction
 

@@ -6,8 +6,8 @@ from __future__ import annotations
 import math
 
 from raytran.run.entry import compose
-from raytran.run.prepare import prepare
-from raytran.run.train import train
+from raytran.run.prepare.prepare import prepare
+from raytran.run.train.fit import train
 
 
 def test_a_real_scan_is_prepared_and_trained_on(shared_dir, tmp_path):

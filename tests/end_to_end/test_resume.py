@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 import torch
 
+from raytran.checkpoints.runs import FINISHED, LAST, PREVIOUS, one_at_a_time
 from raytran.errors import CheckpointError, ConfigError
 from raytran.run.entry import compose
-from raytran.run.folders import FINISHED, LAST, PREVIOUS, one_at_a_time
-from raytran.run.train import train
+from raytran.run.train.fit import train
 from raytran.training.reconstruction import Reconstruction
 
 STEPS = 8

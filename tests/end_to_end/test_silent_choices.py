@@ -11,14 +11,14 @@ import trimesh
 
 import raytran.backbone.resnet
 from raytran.backbone.resnet import ResNet18
+from raytran.checkpoints.file import read_checkpoint
 from raytran.data.scan2cad import annotation_path
-from raytran.data.scannet import read_scan
+from raytran.data.scannet.scan import read_scan
 from raytran.errors import CheckpointError, DataError
 from raytran.run.entry import compose
-from raytran.run.export_model import export_model
-from raytran.run.loggers import read_history
-from raytran.run.train import RANDOM_ENCODER, train
-from raytran.training.checkpoint_file import read_checkpoint
+from raytran.run.export.export_model import export_model
+from raytran.run.train.fit import RANDOM_ENCODER, train
+from raytran.run.train.loggers import read_history
 
 ONE_STEP = ["trainer.max_steps=1", "trainer.val_check_interval=1", "watch.pictures=0"]
 

@@ -8,7 +8,7 @@ import json
 
 import pytest
 
-from raytran.run.folders import LAST
+from raytran.checkpoints.runs import LAST
 
 pytestmark = pytest.mark.slow
 

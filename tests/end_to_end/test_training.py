@@ -16,13 +16,13 @@ import pytest
 import torch
 
 import raytran
+from raytran.checkpoints.runs import LAST, read_finished
 from raytran.errors import CheckpointError, ConfigError
-from raytran.ops import block_pairs
-from raytran.run.curriculum import run_curriculum
+from raytran.ops.triton import block_pairs
 from raytran.run.entry import compose
-from raytran.run.folders import LAST, read_finished
-from raytran.run.loggers import read_history
-from raytran.run.train import train
+from raytran.run.train.curriculum import run_curriculum
+from raytran.run.train.fit import train
+from raytran.run.train.loggers import read_history
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_a_run_describes_itself(trained):
 
 
 def test_a_trained_model_is_loaded_and_predicts(trained, rooms):
-    from raytran.data.scannet import load_views
+    from raytran.data.scannet.scan import load_views
 
     model = raytran.load(trained[1][2].checkpoint)
     scan = sorted((rooms / "scannet" / "scans").iterdir())[0]

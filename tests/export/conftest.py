@@ -16,7 +16,7 @@ import torch
 import trimesh
 
 from raytran.geometry.camera import Cameras
-from raytran.types import ObjectSet, ScenePrediction
+from raytran.structs import ObjectSet, ScenePrediction
 
 # world_from_object of an upright object turned by 30 degrees: width along (cos 30, sin 30, 0), up along z.
 COS, SIN = math.sqrt(3) / 2, 0.5

@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from raytran.export.glb import write_glb
-from raytran.types import ObjectSet
+from raytran.structs import ObjectSet
 
 NODES = {"00_chair", "00_chair_box", "01_table_box"}
 

@@ -13,13 +13,13 @@ import torch
 import trimesh
 
 from raytran.data.scan2cad import read_annotations, scene_alignments, scene_objects
-from raytran.data.shapenet import model_names, read_mesh
-from raytran.data.voxelize import voxelize_solid
+from raytran.data.shapenet.models import model_names, read_mesh
+from raytran.data.shapenet.voxelize import voxelize_solid
 from raytran.errors import DataError
 from raytran.export import nearest_cad as module
 from raytran.export.nearest_cad import nearest_cads
 from raytran.geometry.rotation import matrix_from_quaternion, rotation_from_yaw
-from raytran.types import CLASSES, ObjectSet
+from raytran.structs import CLASSES, ObjectSet
 
 CHAIR, TABLE, LAMP = "03001627", "04379243", "03636649"
 SIDE = 21

@@ -13,10 +13,10 @@ from raytran.errors import ConfigError
 from raytran.export.program import example_inputs, export_network, export_shapes
 from raytran.geometry.camera import Cameras
 from raytran.model import TASKS, RayTran
-from raytran.run.build import build_model
-from raytran.run.camera_paths import walk
 from raytran.run.entry import compose
-from raytran.types import Views
+from raytran.run.plan.camera_paths import walk
+from raytran.run.train.build import build_model
+from raytran.structs import Views
 
 IMAGE_SIZE = (32, 48)
 

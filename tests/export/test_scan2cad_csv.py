@@ -14,7 +14,7 @@ from raytran.export.scan2cad_csv import (
     read_roca_csv,
     write_alignments_csv,
 )
-from raytran.types import CadAlignments
+from raytran.structs import CadAlignments
 
 ROW = "03001627,abc,1,2,3,1,0,0,0,0.5,0.6,0.7"
 

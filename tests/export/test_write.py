@@ -14,7 +14,7 @@ import trimesh
 
 from raytran.errors import DataError, ShapeError
 from raytran.export import read_scene_json, write_prediction
-from raytran.types import ObjectSet, ScenePrediction
+from raytran.structs import ObjectSet, ScenePrediction
 
 
 def test_scene_json_follows_the_contract(tmp_path, prediction, turned, box_at):

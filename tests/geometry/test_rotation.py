@@ -18,7 +18,7 @@ from raytran.geometry.rotation import (
     wrap_angle,
     yaw_from_rotation,
 )
-from raytran.types import SYMMETRY_INFINITE
+from raytran.structs import SYMMETRY_INFINITE
 
 
 def _random(count: int) -> Rotation:

@@ -17,7 +17,7 @@ from raytran.heads.denoising import (
 )
 from raytran.heads.objects import ObjectHead
 from raytran.heads.queries import LearnedQueries, ProposalQueries, Queries
-from raytran.types import ObjectSet
+from raytran.structs import ObjectSet
 
 EXTENT = (4.0, 4.0, 2.0)
 GRID = VoxelGrid((4, 4, 2), EXTENT, torch.tensor([[0.0, 0, 0], [5.0, 0, 0]]))

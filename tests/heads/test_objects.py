@@ -7,7 +7,7 @@ import torch
 from raytran.errors import ConfigError
 from raytran.geometry.grid import VoxelGrid
 from raytran.heads.objects import ObjectHead
-from raytran.types import RawObjects
+from raytran.structs import RawObjects
 
 EXTENT = (4.0, 4.0, 2.0)
 

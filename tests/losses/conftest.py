@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from raytran.geometry.rotation import rotation_from_yaw, yaw_from_rotation
-from raytran.types import PADDING, ObjectSet, RawObjects
+from raytran.structs import PADDING, ObjectSet, RawObjects
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import torch
 
 from raytran.losses.denoising import denoising_losses
 from raytran.losses.pose import Betas
-from raytran.types import ObjectSet, RawObjects
+from raytran.structs import ObjectSet, RawObjects
 
 
 def repeated(objects: ObjectSet, make_perfect, count: int) -> RawObjects:

@@ -8,7 +8,7 @@ import torch
 
 from raytran.errors import ConfigError
 from raytran.losses.matcher import HungarianMatcher
-from raytran.types import PADDING, ObjectSet, RawObjects
+from raytran.structs import PADDING, ObjectSet, RawObjects
 
 WEIGHTS = {"class": 1.0, "center": 2.0, "size": 1.0, "yaw": 1.0}
 

@@ -9,7 +9,7 @@ import torch
 from raytran.errors import ConfigError
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.losses.pose import Betas, pose_errors, yaw_from_vector
-from raytran.types import ObjectSet
+from raytran.structs import ObjectSet
 
 
 def one_object(*, yaw: float = 0.0, symmetry: int = 1) -> ObjectSet:

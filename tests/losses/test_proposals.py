@@ -11,7 +11,7 @@ from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.losses.pose import Betas
 from raytran.losses.proposals import SPREAD, center_heat, proposal_losses
-from raytran.types import ObjectSet, RawProposals
+from raytran.structs import ObjectSet, RawProposals
 
 GRID = VoxelGrid((4, 4, 4), (2.0, 2.0, 2.0), torch.zeros(1, 3))
 

@@ -13,9 +13,9 @@ from raytran.geometry.grid import VoxelGrid
 from raytran.heads.objects import ObjectHead
 from raytran.losses.matcher import HungarianMatcher
 from raytran.losses.total import TotalLoss
-from raytran.types import PADDING, ObjectSet, RawObjects, RawProposals, RawScene, SceneBatch, Views
+from raytran.structs import PADDING, ObjectSet, RawObjects, RawProposals, RawScene, SceneBatch, Views
 
-RawParcel = TypeVar("RawParcel", RawObjects, RawProposals)
+RawStruct = TypeVar("RawStruct", RawObjects, RawProposals)
 WEIGHTS = {
     "occupancy": 1.0,
     "foreground": 0.5,
@@ -87,7 +87,7 @@ def test_class_term_is_the_weighted_mean_over_all_slots(padding, make_objects) -
     torch.testing.assert_close(found["objects/class"], expected)
 
 
-def join(*parts: RawParcel) -> RawParcel:
+def join(*parts: RawStruct) -> RawStruct:
     return type(parts[0])(*(torch.cat([getattr(p, f.name) for p in parts]) for f in fields(parts[0])))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 import torch
 
 from raytran.losses.view import view_loss
-from raytran.types import Views
+from raytran.structs import Views
 
 
 def views_of(images: torch.Tensor) -> Views:

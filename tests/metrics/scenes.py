@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.types import CLASSES, ObjectSet
+from raytran.structs import CLASSES, ObjectSet
 
 CHAIR = CLASSES.index("chair")
 

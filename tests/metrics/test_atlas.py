@@ -9,7 +9,7 @@ import torch
 
 from raytran.metrics import Scan2CADAccuracy
 from raytran.metrics.atlas import CAUSES, FATES, ErrorAtlas
-from raytran.types import CLASSES, ObjectSet
+from raytran.structs import CLASSES, ObjectSet
 
 from .scenes import CHAIR, objects, random_scene
 

@@ -8,7 +8,7 @@ import pytest
 
 from raytran.metrics import Scan2CADAccuracy
 from raytran.metrics.curves import FACTORS, AccuracyCurves, accuracy_by_scene_size
-from raytran.types import ObjectSet
+from raytran.structs import ObjectSet
 
 from .scenes import CHAIR, objects, random_scene
 

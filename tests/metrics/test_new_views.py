@@ -12,7 +12,7 @@ from raytran.errors import ShapeError
 from raytran.geometry.camera import Cameras
 from raytran.metrics import PSNR, SSIM, NewViewScores
 from raytran.metrics.new_views import nearest_frames
-from raytran.types import Views
+from raytran.structs import Views
 
 
 def cameras_at(*places: tuple[float, float, float], turned: tuple[float, ...] | None = None) -> torch.Tensor:

@@ -12,7 +12,7 @@ import torch
 from raytran.errors import ConfigError
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.metrics import OrientedBoxF1
-from raytran.types import ObjectSet
+from raytran.structs import ObjectSet
 
 
 def upright(label, center, size, score=None) -> ObjectSet:

@@ -31,7 +31,7 @@ from raytran.metrics.atlas import ErrorAtlas
 from raytran.metrics.curves import AccuracyCurves
 from raytran.metrics.functional.cad_errors import cad_half_extents, cad_symmetries
 from raytran.metrics.records import SceneRecord, decode_records
-from raytran.types import CadAlignments, ObjectSet, Views
+from raytran.structs import CadAlignments, ObjectSet, Views
 
 SCENES = 7
 SHARES = {"unequal": ((0, 3, 5, 6), (1, 2, 4)), "one without": ((0, 1, 2, 3, 4, 5, 6), ()),

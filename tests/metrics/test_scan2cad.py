@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from raytran.errors import ConfigError, ShapeError
 from raytran.metrics import Scan2CADAccuracy
-from raytran.types import CLASSES, ObjectSet
+from raytran.structs import CLASSES, ObjectSet
 
 UPRIGHT = Rotation.from_rotvec([np.pi / 2, 0, 0])
 CHAIR, TABLE, BIN = (CLASSES.index(name) for name in ("chair", "table", "trashbin"))

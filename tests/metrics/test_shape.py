@@ -13,7 +13,7 @@ from raytran.errors import ShapeError
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.metrics import MatchedShapeScores, Scan2CADAccuracy
 from raytran.metrics.functional.shape import chamfer_distance, grid_iou, surface_points
-from raytran.types import ObjectSet
+from raytran.structs import ObjectSet
 
 
 def block(low: tuple[int, int, int], high: tuple[int, int, int], side: int = 8) -> torch.Tensor:

@@ -38,10 +38,10 @@ def kernel(script):
 @pytest.fixture(scope="module")
 def untrained(tmp_path_factory):
     """A network that has learned nothing, for a package without weights."""
-    from raytran.run.build import build_model, plain
-    from raytran.run.checkpoint import checkpoint_card
+    from raytran.checkpoints.checkpoint import checkpoint_card
+    from raytran.checkpoints.file import write_checkpoint
     from raytran.run.entry import compose
-    from raytran.training.checkpoint_file import write_checkpoint
+    from raytran.run.train.build import build_model, plain
 
     path = tmp_path_factory.mktemp("untrained") / "last.ckpt"
     config = compose("train", ["preset=tiny", "model.grid_resolution=[8,8,4]", f"output_dir={path.parent}"])

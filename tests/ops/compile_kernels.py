@@ -26,10 +26,10 @@ from triton.runtime import JITFunction, driver
 
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.ops.block_attention import block_attention
-from raytran.ops.block_sum import block_sum
 from raytran.ops.pairs import PairList
-from raytran.ops.trace_blocks import trace_blocks
+from raytran.ops.triton.attention import block_attention
+from raytran.ops.triton.sum import block_sum
+from raytran.ops.triton.traverse import trace_blocks
 
 FEATURE_SIZE, RESOLUTION, EXTENT, CHANNELS = (30, 40), (48, 48, 16), (9.0, 9.0, 3.5), 256
 """Those of the paper."""

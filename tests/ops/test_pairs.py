@@ -26,7 +26,7 @@ def test_order_by_pixels_and_by_voxels_by_hand():
     assert turn.tolist() == [2, 0, 3, 4, 1]
 
 
-def test_orders_are_made_once_and_are_no_part_of_the_parcel():
+def test_orders_are_made_once_and_are_no_part_of_the_struct():
     pairs = _pairs()
     assert pairs.by("voxels") is pairs.by("voxels")
     moved = pairs.to("meta")

@@ -7,9 +7,10 @@ from torch import Tensor
 from torch._dynamo.testing import CompileCounterWithBackend
 
 from raytran.errors import ShapeError
-from raytran.ops import fused, pair_attention, reference
+from raytran.ops import pair_attention, reference
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_attention import ray_attention, ray_attention_with_sum
+from raytran.ops.triton import dispatch as fused
 
 DIRECTIONS = ("pixels_to_voxels", "voxels_to_pixels")
 both_directions = pytest.mark.parametrize("direction", DIRECTIONS)

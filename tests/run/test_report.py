@@ -7,9 +7,9 @@ import json
 
 import pytest
 
+from raytran.checkpoints.runs import write_finished
 from raytran.errors import ConfigError, DataError
 from raytran.run.entry import compose
-from raytran.run.folders import write_finished
 from raytran.run.report import find_runs, read_runs, report, training_seconds
 
 TABLE = """step,epoch,train/total,time/data,time/compute,time/scenes_per_second,memory/process

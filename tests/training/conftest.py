@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.run.build import build_model, build_module
 from raytran.run.entry import compose
-from raytran.types import SHAPE_SIZE, ObjectSet, SceneBatch, Views
+from raytran.run.train.build import build_model, build_module
+from raytran.structs import SHAPE_SIZE, ObjectSet, SceneBatch, Views
 
 SMALL = [
     "preset=tiny",

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from raytran.data.augment import Augmentation
-from raytran.run.build import build_data
 from raytran.run.entry import compose
+from raytran.run.train.build import build_data
 from raytran.training.datamodule import SceneDataModule
 
 

@@ -6,8 +6,8 @@ import torch
 
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.losses.matcher import HungarianMatcher
+from raytran.structs import PADDING, ObjectSet, RawObjects
 from raytran.training.health_signals import gradient_norms, slot_signals
-from raytran.types import PADDING, ObjectSet, RawObjects
 
 MATCHER = HungarianMatcher(weights={"class": 1.0, "center": 5.0, "size": 1.0, "yaw": 1.0})
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from raytran.errors import ConfigError
-from raytran.run import build
+from raytran.run.train import build
 from raytran.training.callbacks.stage_setup import StageSetup
 
 STEPS = 15

@@ -17,8 +17,9 @@ from lightning.pytorch.strategies import DDPStrategy
 from torch import nn
 
 from raytran.data.collate import collate_scenes
-from raytran.run.build import build_model, build_module
 from raytran.run.entry import compose
+from raytran.run.train.build import build_model, build_module
+from raytran.structs import ObjectSet
 from raytran.training.callbacks.rank_agreement import RankAgreement
 from raytran.training.callbacks.stage_setup import StageSetup
 from raytran.training.ranks import (
@@ -29,7 +30,6 @@ from raytran.training.ranks import (
     agree,
     mean_over_ranks,
 )
-from raytran.types import ObjectSet
 
 RUNS = {
     "stage1": ("experiment=stage1",),

@@ -9,8 +9,8 @@ import lightning.pytorch as pl
 import pytest
 import torch
 
+from raytran.structs import ObjectSet
 from raytran.training.callbacks.stage_setup import StageSetup
-from raytran.types import ObjectSet
 
 
 def fit(module, batch, **settings):

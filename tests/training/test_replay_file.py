@@ -8,8 +8,8 @@ import torch
 from torch import nn
 
 from raytran.errors import CheckpointError
+from raytran.structs import ObjectSet
 from raytran.training.replay_file import read_replay, write_replay
-from raytran.types import ObjectSet
 
 CARD = {"format": "raytran.checkpoint/1", "stage": "joint", "preset": "tiny", "model": {}, "views": {}}
 

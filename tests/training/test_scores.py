@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from raytran.geometry.rotation import rotation_from_yaw
+from raytran.structs import ObjectSet, SceneBatch, ScenePrediction, Views
 from raytran.training.scores import SceneScores
-from raytran.types import ObjectSet, SceneBatch, ScenePrediction, Views
 
 
 def objects(centers: list[list[float]], scores: list[float]) -> ObjectSet:

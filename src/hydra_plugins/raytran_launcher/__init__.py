@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The launcher of sweeps where Hydra looks for plugins; ``raytran.run.launcher`` does the work."""
+"""The launcher of sweeps where Hydra looks for plugins; ``raytran.run.sweep.launcher`` does the work."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class ProcessLauncher(Launcher):
     def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> Sequence[JobReturn]:
         """Run the jobs and return how each ended, in order."""
         # Imported here: Hydra imports every plugin whatever the command.
-        from raytran.run.launcher import launch
+        from raytran.run.sweep.launcher import launch
 
         if self._config is None or self._context is None:
             raise RuntimeError("launch() was called before setup()")

@@ -14,8 +14,8 @@ from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.position import position_code, ray_code
-from raytran.ops.block_pairs import BlockPairs
 from raytran.ops.pairs import PairList
+from raytran.ops.triton.block_pairs import BlockPairs
 
 
 class Backbone(LiftingBackbone):

@@ -7,9 +7,9 @@ from typing import Literal
 
 from torch import Tensor, nn
 
-from raytran.ops.block_pairs import BlockPairs
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_attention import Direction, ray_attention
+from raytran.ops.triton.block_pairs import BlockPairs
 
 
 class RayTracedBlock(nn.Module):

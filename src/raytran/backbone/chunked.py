@@ -21,10 +21,10 @@ from raytran.backbone.lifting import LiftingBackbone
 from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.ops.block_pairs import BlockPairs
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_attention import ray_attention, ray_attention_with_sum
 from raytran.ops.splat import splat_features
+from raytran.ops.triton.block_pairs import BlockPairs
 
 Trace = Callable[[Cameras], PairList | BlockPairs]
 """From the cameras ``(B, n)`` of a few views to their pixel-voxel pairs."""

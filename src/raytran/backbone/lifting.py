@@ -13,10 +13,10 @@ from raytran.backbone.resnet import ResNet18
 from raytran.errors import ShapeError, check_shape
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.ops.block_pairs import BlockPairs
 from raytran.ops.center_tracer import CenterTracer
 from raytran.ops.pairs import PairList
 from raytran.ops.splat import splat_features
+from raytran.ops.triton.block_pairs import BlockPairs
 
 ImageEncoder = ResNet18 | EfficientNetLite0
 """Normalised images ``(n, 3 or 4, H, W)`` → features ``(n, out_channels, H/stride, W/stride)``."""

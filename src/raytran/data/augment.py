@@ -17,7 +17,7 @@ from torch import Tensor
 
 from raytran.data.views import choose_random
 from raytran.errors import ConfigError
-from raytran.types import ObjectSet, SceneBatch, Views
+from raytran.structs import ObjectSet, SceneBatch, Views
 
 _MIRROR = torch.diag(torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64))
 """x → -x, of the world, of a camera and of an object alike."""

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from raytran.errors import ShapeError
-from raytran.types import SceneBatch, Views
+from raytran.structs import SceneBatch, Views
 
 
 def collate_scenes(samples: Sequence[SceneBatch]) -> SceneBatch:

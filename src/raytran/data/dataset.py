@@ -17,7 +17,7 @@ from raytran.data.augment import Augmentation
 from raytran.data.cache import MaskCache
 from raytran.data.images import MIN_VIEWS
 from raytran.data.scan2cad import SceneAnnotation, annotation_path, read_annotations, scene_objects
-from raytran.data.scannet import Scan, scan_views
+from raytran.data.scannet.scan import Scan, scan_views
 from raytran.data.scene_list import ObjectTable, RecentScans, annotated, choose_scenes, read_split
 from raytran.data.targets import (
     foreground_masks,
@@ -30,7 +30,7 @@ from raytran.data.views import choose_even, choose_random, hold_out
 from raytran.errors import ConfigError, DataError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.types import ObjectSet, SceneBatch, Views
+from raytran.structs import ObjectSet, SceneBatch, Views
 
 TARGETS: tuple[str, ...] = ("objects", "shapes", "occupancy", "foreground")
 """Targets a data set can give; "shapes" gives the objects too."""

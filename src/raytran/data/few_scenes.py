@@ -9,7 +9,7 @@ from typing import Any
 from torch.utils.data import Dataset
 
 from raytran.data.dataset import scan2cad_dataset
-from raytran.types import SceneBatch
+from raytran.structs import SceneBatch
 
 
 class FewScenes(Dataset[SceneBatch]):

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from raytran.data.images import decode_image
-from raytran.data.sens import SensFile
+from raytran.data.scannet.sens import SensFile
 from raytran.errors import DataError
 
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from raytran.data.cache import file_digest
 from raytran.errors import DataError
 from raytran.geometry.rotation import matrix_from_quaternion, quaternion_from_matrix
-from raytran.types import CLASS_BY_CATID, CLASSES, SYMMETRY_INFINITE, CadAlignments, ObjectSet
+from raytran.structs import CLASS_BY_CATID, CLASSES, SYMMETRY_INFINITE, CadAlignments, ObjectSet
 
 _log = logging.getLogger(__name__)
 

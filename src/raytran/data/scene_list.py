@@ -11,9 +11,9 @@ from pathlib import Path
 import torch
 
 from raytran.data.scan2cad import SceneAnnotation
-from raytran.data.scannet import Scan, read_scan
+from raytran.data.scannet.scan import Scan, read_scan
 from raytran.errors import DataError
-from raytran.types import ObjectSet
+from raytran.structs import ObjectSet
 
 
 def choose_scenes(

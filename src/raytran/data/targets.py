@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from raytran.data.cache import MaskCache, digest, file_digest
-from raytran.data.shapenet import mesh_path, read_mesh
-from raytran.data.voxelize import voxelize_solid
+from raytran.data.shapenet.models import mesh_path, read_mesh
+from raytran.data.shapenet.voxelize import voxelize_solid
 from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.ops.rasterize import rasterize_ids, rasterize_mask, rasterize_visible
-from raytran.types import SHAPE_SIZE, ObjectSet
+from raytran.geometry.rasterize import rasterize_ids, rasterize_mask, rasterize_visible
+from raytran.structs import SHAPE_SIZE, ObjectSet
 
 _MAX_POINTS = 1 << 25
 """Most points that may fill one object's box; with more it is far larger than any room."""

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from raytran.types import SceneBatch
+from raytran.structs import SceneBatch
 
 _log = logging.getLogger(__name__)
 

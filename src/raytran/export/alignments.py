@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from raytran.geometry.rotation import quaternion_from_matrix
-from raytran.types import CadAlignments, ObjectSet
+from raytran.structs import CadAlignments, ObjectSet
 
 
 def align_cads(

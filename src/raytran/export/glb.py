@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from raytran.export.mesh import object_name
 from raytran.geometry.camera import Cameras
-from raytran.types import CLASS_COLORS, CLASSES, ObjectSet
+from raytran.structs import CLASS_COLORS, CLASSES, ObjectSet
 
 WORLD = "world_z_up"
 """Node above all others; it turns the world's +Z to glTF's +Y."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import trimesh
 
-from raytran.types import CLASS_COLORS, CLASSES, ObjectSet
+from raytran.structs import CLASS_COLORS, CLASSES, ObjectSet
 
 _DECIMALS = 5
 """Digits behind the point in an OBJ: a hundredth of a millimetre."""

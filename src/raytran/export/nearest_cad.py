@@ -16,13 +16,13 @@ import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
-from raytran.data.shapenet import categories, model_names, read_facts, read_mesh, shapenet_version
+from raytran.data.shapenet.models import categories, model_names, read_facts, read_mesh, shapenet_version
+from raytran.data.shapenet.voxelize import voxelize_solid
 from raytran.data.targets import object_meshes
-from raytran.data.voxelize import voxelize_solid
 from raytran.data.workers import work_on
 from raytran.errors import DataError
 from raytran.export.alignments import align_cads
-from raytran.types import CLASS_BY_CATID, CLASSES, SHAPE_SIZE, CadAlignments, ObjectSet
+from raytran.structs import CLASS_BY_CATID, CLASSES, SHAPE_SIZE, CadAlignments, ObjectSet
 
 _log = logging.getLogger(__name__)
 
@@ -86,8 +86,8 @@ def nearest_cads(objects: ObjectSet, root: Path, *, processes: int = 0, progress
 
     Args:
         objects: ``M`` objects.
-        root: folder of CAD models in ShapeNet's layout, as for ``raytran.data.shapenet.mesh_path``. Models
-            that cannot be read are left out and counted.
+        root: folder of CAD models in ShapeNet's layout, as for ``raytran.data.shapenet.models.mesh_path``.
+            Models that cannot be read are left out and counted.
         processes: worker processes, 0 for one per core.
         progress: show a progress bar for each class.
 

@@ -15,7 +15,7 @@ import torch
 
 from raytran.data.atomic import write_text
 from raytran.errors import DataError
-from raytran.types import CadAlignments
+from raytran.structs import CadAlignments
 
 _log = logging.getLogger(__name__)
 

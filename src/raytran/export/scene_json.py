@@ -13,7 +13,7 @@ import torch
 from raytran.data.atomic import write_text
 from raytran.errors import DataError
 from raytran.geometry.rotation import yaw_from_rotation
-from raytran.types import CLASSES, ObjectSet, ScenePrediction
+from raytran.structs import CLASSES, ObjectSet, ScenePrediction
 
 FORMAT = "raytran.scene/1"
 """Value of ``format``; the number rises when a reader of the old form could misread the new one."""

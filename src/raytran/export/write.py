@@ -14,7 +14,7 @@ from raytran.export.mesh import write_meshes
 from raytran.export.occupancy import write_occupancy
 from raytran.export.scene_json import write_scene_json
 from raytran.geometry.camera import Cameras
-from raytran.types import ScenePrediction
+from raytran.structs import ScenePrediction
 
 
 def write_prediction(

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from raytran.errors import ShapeError, check_shape
-from raytran.types import Views
+from raytran.structs import Views
 
 
 @dataclass(frozen=True)
@@ -112,3 +114,25 @@ class Cameras:
         in_image = in_camera @ self.intrinsics.transpose(-1, -2)
         depth = in_camera[..., 2]
         return in_image[..., :2] / in_image[..., 2:].where(in_image[..., 2:] != 0, 1.0), depth
+
+
+def pose_from_heading(
+    eye: NDArray[np.float64], heading: float, down: float, roll: float
+) -> NDArray[np.float64]:
+    """Return the ``world_from_camera`` pose ``(4, 4)`` of a camera that looks in a direction.
+
+    Args:
+        eye: ``(3,)`` metres.
+        heading: angle of the viewing direction about z from the x axis, radians.
+        down: angle of the viewing direction below the horizon, radians.
+        roll: turn about the viewing direction, radians.
+    """
+    forward = np.array([np.cos(heading) * np.cos(down), np.sin(heading) * np.cos(down), -np.sin(down)])
+    right = np.array([np.sin(heading), -np.cos(heading), 0.0])
+    below = np.cross(forward, right)
+    pose = np.eye(4)
+    pose[:3, 0] = np.cos(roll) * right + np.sin(roll) * below
+    pose[:3, 1] = np.cos(roll) * below - np.sin(roll) * right
+    pose[:3, 2] = forward
+    pose[:3, 3] = eye
+    return pose

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from raytran.errors import check_shape
-from raytran.types import SYMMETRY_INFINITE
+from raytran.structs import SYMMETRY_INFINITE
 
 
 def upright_basis(*, dtype: torch.dtype = torch.float32, device: torch.device | None = None) -> Tensor:

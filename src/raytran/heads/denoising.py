@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.rotation import yaw_from_rotation
 from raytran.heads.queries import QUERY_SCALE, Queries
-from raytran.types import CLASSES, ObjectSet
+from raytran.structs import CLASSES, ObjectSet
 
 CENTER_NOISE = 0.5
 """Largest shift of a centre, as a multiple of the object's size along each of its axes: it stays inside."""

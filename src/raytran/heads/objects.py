@@ -16,7 +16,7 @@ from raytran.geometry.position import position_code
 from raytran.heads.decoder import DecoderLayer
 from raytran.heads.denoising import NoisyCopies, attention_mask, join_queries
 from raytran.heads.queries import LearnedQueries, ProposalQueries, Queries
-from raytran.types import CLASSES, ObjectSet, RawObjects, RawProposals
+from raytran.structs import CLASSES, ObjectSet, RawObjects, RawProposals
 
 
 class ObjectHead(nn.Module):

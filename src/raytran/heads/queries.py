@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.quasirandom import SobolEngine
 
 from raytran.geometry.grid import VoxelGrid
-from raytran.types import CLASSES, RawProposals
+from raytran.structs import CLASSES, RawProposals
 
 QUERY_SCALE = 0.1
 """Standard deviation of the query embeddings before training: small, so that what they read outweighs it."""

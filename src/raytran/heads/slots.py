@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.types import PADDING, ObjectSet, RawObjects
+from raytran.structs import PADDING, ObjectSet, RawObjects
 
 
 def objects_of_slots(

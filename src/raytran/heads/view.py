@@ -11,8 +11,8 @@ from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.position import ray_code
 from raytran.heads.grow import growing_layers
-from raytran.ops.block_pairs import BlockPairs
 from raytran.ops.pairs import PairList
+from raytran.ops.triton.block_pairs import BlockPairs
 
 
 class ViewHead(nn.Module):

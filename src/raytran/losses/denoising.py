@@ -12,7 +12,7 @@ from raytran.heads.denoising import copied_objects
 from raytran.losses.matcher import Match
 from raytran.losses.objects import object_losses
 from raytran.losses.pose import Betas
-from raytran.types import ObjectSet, RawObjects
+from raytran.structs import ObjectSet, RawObjects
 
 
 def denoising_losses(

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from raytran.errors import ConfigError
 from raytran.losses.pose import Betas, pose_errors
-from raytran.types import ObjectSet, RawObjects
+from raytran.structs import ObjectSet, RawObjects
 
 UNUSABLE = 1e6
 """Cost in place of one that is not finite, as 16-bit training meets in steps that its scaler then skips."""

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from raytran.losses.matcher import Match
 from raytran.losses.pose import Betas, pose_errors
-from raytran.types import PADDING, ObjectSet, RawObjects
+from raytran.structs import PADDING, ObjectSet, RawObjects
 
 
 def object_losses(

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from raytran.errors import ConfigError
 from raytran.geometry.rotation import symmetric_yaw_error, yaw_from_rotation
-from raytran.types import ObjectSet
+from raytran.structs import ObjectSet
 
 
 class Betas(NamedTuple):

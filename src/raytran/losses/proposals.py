@@ -10,7 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from raytran.losses.pose import Betas, pose_errors
-from raytran.types import ObjectSet, RawProposals
+from raytran.structs import ObjectSet, RawProposals
 
 SPREAD = 0.7
 """Standard deviation of the heat around a centre, in voxels."""

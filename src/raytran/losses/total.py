@@ -20,7 +20,7 @@ from raytran.losses.pose import Betas
 from raytran.losses.proposals import proposal_losses
 from raytran.losses.shape import shape_loss
 from raytran.losses.view import view_loss
-from raytran.types import ObjectSet, RawObjects, RawScene, SceneBatch
+from raytran.structs import ObjectSet, RawObjects, RawScene, SceneBatch
 
 WEIGHTS = ("occupancy", "foreground", "class", "center", "size", "yaw", "heat", "shape", "view")
 TERMS = ("occupancy", "foreground", "objects", "shape", "view")

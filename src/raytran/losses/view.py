@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor
 
-from raytran.types import Views
+from raytran.structs import Views
 
 
 def view_loss(logits: Tensor, target: Views) -> Tensor:

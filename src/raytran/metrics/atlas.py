@@ -13,7 +13,7 @@ from raytran.metrics.curves import DEFAULT_LIMITS
 from raytran.metrics.functional.alignment import alignment_errors
 from raytran.metrics.functional.matching import match_in_order, score_order
 from raytran.metrics.records import Row, SceneRecord, SceneRecordMetric
-from raytran.types import CLASSES, ObjectSet
+from raytran.structs import CLASSES, ObjectSet
 
 CAUSES: tuple[str, ...] = (
     "found",

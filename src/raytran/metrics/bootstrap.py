@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from raytran.metrics.records import Row
-from raytran.types import CLASSES
+from raytran.structs import CLASSES
 
 Statistic = Callable[[Tensor], Tensor]
 """From summed counts ``(R, C)`` to a number each, ``(R,)``."""

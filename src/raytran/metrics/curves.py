@@ -15,7 +15,7 @@ from torch import Tensor
 from raytran.metrics.functional.alignment import alignment_errors
 from raytran.metrics.functional.matching import score_order
 from raytran.metrics.records import Row, SceneRecord, SceneRecordMetric
-from raytran.types import CLASSES, ObjectSet
+from raytran.structs import CLASSES, ObjectSet
 
 DEFAULT_LIMITS = (0.2, 20.0, 0.2)
 """Metres, degrees and ratio of the Scan2CAD benchmark."""

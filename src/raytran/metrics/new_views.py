@@ -13,7 +13,7 @@ from raytran.errors import ShapeError
 from raytran.geometry.camera import Cameras
 from raytran.metrics.image import psnr_of_frames, ssim_of_frames
 from raytran.metrics.records import RecordMetric, Row, SceneRecord
-from raytran.types import Views
+from raytran.structs import Views
 
 _COLUMNS = ("psnr", "ssim", "psnr_best_constant", "psnr_nearest_frame")
 

@@ -22,7 +22,7 @@ from raytran.metrics.functional.cad_errors import cad_half_extents
 from raytran.metrics.functional.matching import match_in_order, score_order
 from raytran.metrics.functional.odam import bev_iou, odam_predicted_boxes, odam_true_boxes
 from raytran.metrics.records import ProtocolMetric, Row, SceneRecord
-from raytran.types import CLASSES, CadAlignments, ObjectSet
+from raytran.structs import CLASSES, CadAlignments, ObjectSet
 
 BOX_F1_PROTOCOLS: tuple[str, ...] = ("strict", "odam")
 

@@ -16,7 +16,7 @@ from torchmetrics.utilities import dim_zero_cat
 from torchmetrics.utilities.distributed import gather_all_tensors
 
 from raytran.errors import ShapeError
-from raytran.types import CadAlignments, ObjectSet
+from raytran.structs import CadAlignments, ObjectSet
 
 Row = dict[str, str | int | float | bool | None]
 """One line of a table: column name to value, None where there is none."""

@@ -16,7 +16,7 @@ from raytran.metrics.functional.matching import match_in_order, score_order
 from raytran.metrics.functional.scan2cad import match_scan2cad
 from raytran.metrics.functional.vid2cad import VID2CAD_CLASS_BY_CATID, match_vid2cad
 from raytran.metrics.records import ProtocolMetric, Row, SceneRecord
-from raytran.types import CLASSES, CadAlignments, ObjectSet
+from raytran.structs import CLASSES, CadAlignments, ObjectSet
 
 SCAN2CAD_PROTOCOLS: tuple[str, ...] = ("strict", "scan2cad", "vid2cad")
 

@@ -15,7 +15,7 @@ from raytran.metrics.functional.matching import match_in_order, score_order
 from raytran.metrics.functional.shape import chamfer_distance, grid_iou, surface_points
 from raytran.metrics.records import Row, SceneRecord, SceneRecordMetric
 from raytran.metrics.scan2cad import Scan2CADAccuracy
-from raytran.types import CLASSES, ObjectSet
+from raytran.structs import CLASSES, ObjectSet
 
 
 class ClassShapes(TypedDict):

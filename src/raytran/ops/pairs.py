@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from raytran.errors import ShapeError, check_shape
-from raytran.ops.block_pairs import BlockPairs, kept
-from raytran.ops.tiling import Tiling
-from raytran.parcel import Parcel
+from raytran.ops.triton.block_pairs import BlockPairs, kept
+from raytran.ops.triton.tiling import Tiling
+from raytran.structs import TensorStruct
 
 Side = Literal["pixels", "voxels"]
 
@@ -34,7 +34,7 @@ class PairOrder(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PairList(Parcel):
+class PairList(TensorStruct):
     """The ``P`` pairs of a pixel and a voxel that a ray joins, each once, sorted by pixel, then by voxel.
 
     "Pixel" is the paper's word for a cell of the feature map. In a batch, pixels are numbered scene-major,

@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from raytran.errors import check_shape
-from raytran.ops.block_pairs import BlockPairs
-from raytran.ops.fused import fused_blocks, listed
 from raytran.ops.pair_attention import pair_attention
 from raytran.ops.pairs import PairList
+from raytran.ops.triton.block_pairs import BlockPairs
+from raytran.ops.triton.dispatch import fused_blocks, listed
 
 Direction = Literal["pixels_to_voxels", "voxels_to_pixels"]
 
@@ -91,7 +91,7 @@ def _attend(
     blocks = fused_blocks(pairs, query.device, dtype, query.shape[2])
     if blocks is not None:
         # CPU installations of torch lack Triton: its module is imported only where it runs.
-        from raytran.ops.block_attention import block_attention
+        from raytran.ops.triton.attention import block_attention
 
         qkv = query.to(dtype), key.to(dtype), value.to(dtype)
         out, logsumexp = block_attention(*qkv, blocks, to_voxels=to_voxels)

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from raytran.errors import check_shape
-from raytran.ops.block_pairs import BlockPairs
-from raytran.ops.fused import fused_blocks, listed
 from raytran.ops.pairs import PairList, PairOrder
 from raytran.ops.segment import sparse_product
+from raytran.ops.triton.block_pairs import BlockPairs
+from raytran.ops.triton.dispatch import fused_blocks, listed
 
 
 def splat_features(features: Tensor, pairs: PairList | BlockPairs) -> tuple[Tensor, Tensor]:
@@ -38,7 +38,7 @@ def splat_features(features: Tensor, pairs: PairList | BlockPairs) -> tuple[Tens
     blocks = fused_blocks(pairs, features.device, features.dtype, channels=1)
     if blocks is not None:
         # CPU installations of torch lack Triton: its module is imported only where it runs.
-        from raytran.ops.block_sum import block_sum
+        from raytran.ops.triton.sum import block_sum
 
         count = blocks.pixels_per_voxel()
         mean = block_sum(features, blocks) / count.clamp(min=1)[:, None]

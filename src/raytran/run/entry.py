@@ -14,13 +14,14 @@ import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import ConfigCompositionException, InstantiationException, OverrideParseException
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from raytran.checkpoints.launched import first_ranks
+from raytran.checkpoints.runs import run_folder
 from raytran.errors import ConfigError, RaytranError
 from raytran.run.config_dir import config_dir
-from raytran.run.folders import register_resolvers
-from raytran.run.sweep_folder import register_sweep_resolver
+from raytran.run.sweep.folder import register_sweep_resolver
 
 _FULL_ERROR = "HYDRA_FULL_ERROR"
 """Hydra's own switch: with it set to 1, errors are shown at length."""
@@ -156,3 +157,12 @@ def _exit_with(error: RaytranError) -> None:
     if os.environ.get(_FULL_ERROR) == "1":
         raise error
     raise SystemExit(1)
+
+
+def register_resolvers() -> None:
+    """Make ``${run_folder:…}`` known to the configs; evaluated once per command, by the first rank."""
+
+    def resolve(*arguments: str) -> str:
+        return first_ranks(f"the folder of {' '.join(arguments)}", lambda: run_folder(*arguments))
+
+    OmegaConf.register_new_resolver("run_folder", resolve, use_cache=True, replace=True)

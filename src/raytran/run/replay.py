@@ -14,17 +14,16 @@ from omegaconf import DictConfig
 from rich.console import Console
 from torch import Tensor, nn
 
+from raytran.checkpoints.checkpoint import model_from
+from raytran.checkpoints.network import trusted_packages
 from raytran.errors import CheckpointError, ConfigError
 from raytran.losses.matcher import HungarianMatcher
 from raytran.losses.total import TotalLoss
 from raytran.model import RayTran, inputs_of
-from raytran.parcel import Parcel
-from raytran.run.checkpoint import model_from
-from raytran.run.checkpoint_config import trusted_packages
 from raytran.run.device import choose_device, set_matmul_precision
+from raytran.structs import SceneBatch, TensorStruct
 from raytran.training.replay_file import read_replay
 from raytran.training.stage import Stage
-from raytran.types import SceneBatch
 
 PRECISIONS = {"32-true": None, "bf16-mixed": torch.bfloat16, "16-mixed": torch.float16}
 
@@ -135,7 +134,7 @@ def _watched(model: nn.Module, parts: list[str]) -> Iterator[None]:
 def _is_finite(value: Any) -> bool:
     if isinstance(value, Tensor):
         return not value.is_floating_point() or bool(value.isfinite().all())
-    if isinstance(value, Parcel):
+    if isinstance(value, TensorStruct):
         return all(_is_finite(item) for item in vars(value).values())
     return all(map(_is_finite, value)) if isinstance(value, tuple | list) else True
 

@@ -14,11 +14,11 @@ from typing import Any
 import yaml
 from omegaconf import DictConfig
 
+from raytran.checkpoints.runs import read_finished
 from raytran.errors import CheckpointError, ConfigError, DataError
-from raytran.run.folders import read_finished
-from raytran.run.loggers import METRICS, read_history
-from raytran.view.curves import History
-from raytran.view.run_comparison import RunRecord, final, write_run_comparison
+from raytran.pictures.curves import History
+from raytran.pictures.run_comparison import RunRecord, final, write_run_comparison
+from raytran.run.train.loggers import METRICS, read_history
 
 _log = logging.getLogger(__name__)
 

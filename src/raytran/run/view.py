@@ -12,8 +12,8 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from raytran.errors import ConfigError
-from raytran.view.viewer.scenes import find_scenes
-from raytran.view.viewer.server import Viewer
+from raytran.viewer.scenes import find_scenes
+from raytran.viewer.server import Viewer
 
 _log = logging.getLogger(__name__)
 

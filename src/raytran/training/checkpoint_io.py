@@ -8,8 +8,8 @@ from typing import Any
 
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 
+from raytran.checkpoints.file import read_checkpoint, write_checkpoint
 from raytran.errors import CheckpointError
-from raytran.training.checkpoint_file import read_checkpoint, write_checkpoint
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):

@@ -17,9 +17,8 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from raytran.data.augment import Augmentation
 from raytran.data.collate import collate_scenes
-from raytran.parcel import Parcel
+from raytran.structs import SceneBatch, TensorStruct
 from raytran.training.scene_stream import SceneStream
-from raytran.types import SceneBatch
 
 _log = logging.getLogger(__name__)
 
@@ -172,6 +171,6 @@ def _bytes_of(value: Any) -> int:
     """Return the size of all tensors in a batch."""
     if isinstance(value, Tensor):
         return value.nbytes
-    if isinstance(value, Parcel):
+    if isinstance(value, TensorStruct):
         return sum(_bytes_of(item) for item in vars(value).values())
     return sum(map(_bytes_of, value)) if isinstance(value, tuple) else 0

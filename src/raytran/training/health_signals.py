@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from raytran.losses.matcher import HungarianMatcher, Match
+from raytran.structs import PADDING, ObjectSet, RawObjects, RawScene
 from raytran.training.ranks import mean_over_ranks
-from raytran.types import PADDING, ObjectSet, RawObjects, RawScene
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,12 @@ from torchmetrics import MeanMetric
 
 from raytran.losses.total import TotalLoss
 from raytran.model import RayTran, inputs_of
+from raytran.structs import RawScene, SceneBatch
 from raytran.training.health_signals import StepOutcome
 from raytran.training.optim import Optimization
 from raytran.training.ranks import mean_over_ranks
 from raytran.training.scores import SceneScores
 from raytran.training.stage import Stage
-from raytran.types import RawScene, SceneBatch
 
 
 class Reconstruction(pl.LightningModule):

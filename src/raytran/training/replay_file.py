@@ -10,9 +10,9 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from raytran.checkpoints.file import read_checkpoint, write_checkpoint
 from raytran.errors import CheckpointError
-from raytran.training.checkpoint_file import read_checkpoint, write_checkpoint
-from raytran.types import ObjectSet, SceneBatch, Views
+from raytran.structs import ObjectSet, SceneBatch, Views
 
 
 def write_replay(
@@ -66,7 +66,7 @@ def read_replay(path: Path) -> tuple[dict[str, Any], list[SceneBatch]]:
 
 
 def _plain(value: Any) -> Any:
-    """Return parcels as dictionaries, tuples as lists."""
+    """Return structs as dictionaries, tuples as lists."""
     if is_dataclass(value) and not isinstance(value, type):
         return {field.name: _plain(getattr(value, field.name)) for field in fields(value)}
     if isinstance(value, tuple):

@@ -20,7 +20,7 @@ from raytran.metrics.scan2cad import Scan2CADAccuracy
 from raytran.metrics.scene import ForegroundIoU, SceneOccupancyIoU
 from raytran.metrics.shape import MatchedShapeScores
 from raytran.postprocess import select_objects
-from raytran.types import ObjectSet, SceneBatch, ScenePrediction
+from raytran.structs import ObjectSet, SceneBatch, ScenePrediction
 
 SCORE_THRESHOLD = 0.5
 DUPLICATE_IOU = 0.25

@@ -14,7 +14,7 @@ from torch import Tensor
 from raytran.geometry.boxes import OrientedBoxes
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.rotation import yaw_from_rotation
-from raytran.types import CLASS_COLORS, CLASSES, ObjectSet, SceneBatch, ScenePrediction
+from raytran.structs import CLASS_COLORS, CLASSES, ObjectSet, SceneBatch, ScenePrediction
 
 _TRUE = (255, 255, 255)
 _CAMERA = (255, 200, 0)

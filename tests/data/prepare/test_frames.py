@@ -15,8 +15,8 @@ from raytran.data.prepare.frames import (
     nearest_first,
     write_frames,
 )
-from raytran.data.scan_text import read_matrix
-from raytran.data.scannet import read_scan
+from raytran.data.scannet.scan import read_scan
+from raytran.data.scannet.text import read_matrix
 from raytran.errors import DataError
 
 

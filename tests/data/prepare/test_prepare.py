@@ -18,7 +18,7 @@ from PIL import Image
 from raytran.data.dataset import scan2cad_dataset
 from raytran.data.prepare import PrepareSettings, Released, prepare_scan2cad
 from raytran.data.scan2cad import read_annotations
-from raytran.data.scannet import read_scan, read_sens
+from raytran.data.scannet.scan import read_scan, read_sens
 from raytran.errors import ConfigError, DataError
 
 SETTINGS = PrepareSettings((16, 24), max_frames=3)

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from raytran.data.scan2cad import read_annotations, scene_alignments
-from raytran.types import CadAlignments
+from raytran.structs import CadAlignments
 
 NAMED = ["02808440", "02871439", "02933112", "03001627", "03211117", "04256520", "04379243", "02747177"]
 UNNAMED = ["02818832", "03337140", "03636649"]

@@ -17,7 +17,7 @@ from raytran.geometry.boxes import OrientedBoxes, box_iou
 from raytran.metrics import OrientedBoxF1
 from raytran.metrics.functional.cad_errors import cad_half_extents
 from raytran.metrics.functional.odam import bev_iou
-from raytran.types import CadAlignments
+from raytran.structs import CadAlignments
 
 EIGHT = {"03211117", "04379243", "02808440", "02747177", "04256520", "03001627", "02933112", "02871439"}
 THRESHOLDS = (0.1, 0.25, 0.5)

@@ -14,7 +14,7 @@ from raytran.data.scan2cad import read_annotations, scene_alignments, scene_obje
 from raytran.errors import ConfigError, ShapeError
 from raytran.metrics import Scan2CADAccuracy
 from raytran.metrics.functional.cad_errors import cad_symmetries, comb_rotation_error
-from raytran.types import CLASSES, CadAlignments, ObjectSet
+from raytran.structs import CLASSES, CadAlignments, ObjectSet
 
 TOP = {
     "02808440": "bathtub", "02871439": "bookshelf", "02933112": "cabinet", "03001627": "chair",

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from raytran.metrics import Scan2CADAccuracy
-from raytran.types import CadAlignments
+from raytran.structs import CadAlignments
 
 CLASS_OF = {
     "02808440": "bathtub", "02871439": "bookshelf", "02933112": "cabinet", "03001627": "chair",

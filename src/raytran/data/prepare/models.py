@@ -9,7 +9,7 @@ from pathlib import Path
 from raytran.data.cache import MaskCache
 from raytran.data.prepare.annotation import NO_CAD
 from raytran.data.prepare.scan import check_room
-from raytran.data.shapenet import copy_model, has_model
+from raytran.data.shapenet.models import copy_model, has_model
 from raytran.data.targets import shape_grids
 from raytran.errors import DataError
 

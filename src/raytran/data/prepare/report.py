@@ -17,7 +17,7 @@ from raytran.data.prepare.annotation import Annotations, Entry, LeftOut
 from raytran.data.prepare.scan import read_facts
 from raytran.data.prepare.sources import Sources
 from raytran.data.scan2cad import SceneAnnotation, parse_entry, scene_objects
-from raytran.types import CLASSES, ObjectSet
+from raytran.structs import CLASSES, ObjectSet
 
 
 @dataclass(frozen=True)

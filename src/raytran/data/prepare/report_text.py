@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from textwrap import fill
 from typing import Any
 
-from raytran.types import CLASSES
+from raytran.structs import CLASSES
 
 PAPER_SCENES = {"train": 1194, "val": 306}
 """Annotated scans of RayTran §4."""

@@ -20,7 +20,7 @@ from raytran.data.prepare.report_text import report_text
 from raytran.data.prepare.scan import ScanJob, prepare_scan, scan_folder
 from raytran.data.prepare.settings import PrepareSettings
 from raytran.data.prepare.sources import Sources
-from raytran.data.shapenet import has_model
+from raytran.data.shapenet.models import has_model
 
 _log = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from raytran.geometry.rotation import geodesic_angle
-from raytran.types import SYMMETRY_INFINITE, ObjectSet
+from raytran.structs import SYMMETRY_INFINITE, ObjectSet
 
 
 class AlignmentErrors(NamedTuple):

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from raytran.metrics.functional.alignment import AlignmentErrors
-from raytran.types import SYMMETRY_INFINITE, CadAlignments
+from raytran.structs import SYMMETRY_INFINITE, CadAlignments
 
 _COMB = 36
 """The scripts try an infinite symmetry at every ten degrees."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from raytran.errors import ShapeError
 from raytran.geometry.rotation import matrix_from_quaternion
-from raytran.types import CLASS_BY_CATID, CadAlignments
+from raytran.structs import CLASS_BY_CATID, CadAlignments
 
 _SMALLEST_SCALE = 1e-3
 

@@ -13,7 +13,7 @@ from raytran.errors import ShapeError
 from raytran.metrics.functional.alignment import AlignmentErrors
 from raytran.metrics.functional.cad_errors import cad_errors, equal_names
 from raytran.metrics.functional.matching import match_in_order
-from raytran.types import CadAlignments
+from raytran.structs import CadAlignments
 
 
 def match_scan2cad(

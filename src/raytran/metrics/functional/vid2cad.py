@@ -13,7 +13,7 @@ from raytran.errors import ShapeError
 from raytran.metrics.functional.alignment import AlignmentErrors
 from raytran.metrics.functional.cad_errors import cad_errors, equal_names
 from raytran.metrics.functional.matching import match_in_order
-from raytran.types import CLASS_BY_CATID, CadAlignments
+from raytran.structs import CLASS_BY_CATID, CadAlignments
 
 VID2CAD_CLASS_BY_CATID: dict[str, str] = {**CLASS_BY_CATID, "02818832": "bed"}
 """The nine classes of the script: bed instead of ``other``."""

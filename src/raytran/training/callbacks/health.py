@@ -15,10 +15,10 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from raytran.errors import CheckpointError, NonFiniteError
+from raytran.structs import SceneBatch
 from raytran.training.health_signals import RunningStatistics, gradient_norms, slot_signals
 from raytran.training.reconstruction import Reconstruction
 from raytran.training.replay_file import write_replay
-from raytran.types import SceneBatch
 
 _log = logging.getLogger(__name__)
 

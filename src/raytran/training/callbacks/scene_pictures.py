@@ -19,11 +19,11 @@ from raytran.data.atomic import finished_folder, no_room
 from raytran.data.collate import collate_scenes
 from raytran.data.views import choose_even
 from raytran.model import inputs_of
+from raytran.pictures.scene_pictures import draw_scene
 from raytran.postprocess import select_objects
+from raytran.structs import SceneBatch, ScenePrediction
 from raytran.training.reconstruction import Reconstruction
 from raytran.training.scores import DUPLICATE_IOU, SCORE_THRESHOLD
-from raytran.types import SceneBatch, ScenePrediction
-from raytran.view.scene_pictures import draw_scene
 
 _log = logging.getLogger(__name__)
 

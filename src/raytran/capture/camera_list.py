@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cameras without images, from which a scene is to be rendered: our own list, or nerfstudio's."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from raytran.capture.json_file import numbers, read_object
+from raytran.capture.lens import Lens, check_lens
+from raytran.capture.nerfstudio import frame_lens, frame_pose, undo_applied
+from raytran.capture.orient import OPENGL
+from raytran.data.scannet.text import are_rigid
+from raytran.errors import DataError
+from raytran.geometry.camera import Cameras
+
+MOST = 10_000
+"""More cameras than this are a mistake."""
+
+_NAME = re.compile(r"[\w-][\w. -]{0,99}")
+"""What may serve as a file name everywhere."""
+
+
+@dataclass(frozen=True)
+class CameraList:
+    """V cameras, each with a name and the size of its image.
+
+    Attributes:
+        names: different ones, fit for file names.
+        lenses: of each, for the size of its image.
+        world_from_camera: ``(V, 4, 4)`` float64, OpenCV axes, metres.
+    """
+
+    names: tuple[str, ...]
+    lenses: tuple[Lens, ...]
+    world_from_camera: Tensor
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def scaled_to(self, image_size: tuple[int, int]) -> Cameras:
+        """Return the cameras of the same images resized to one size ``(H, W)``, leading shape ``(V,)``."""
+        matrices = torch.stack([lens.scaled_to(image_size).matrix for lens in self.lenses])
+        return Cameras(matrices.float(), self.world_from_camera.float(), image_size)
+
+
+def read_camera_list(path: Path) -> CameraList:
+    """Read a list of cameras; docs/novel-view.md describes both forms.
+
+    Our own has ``views``, each with ``world_from_camera`` (4×4, OpenCV axes), ``intrinsics`` (3×3, or fx, fy,
+    cx, cy), ``image_size`` [H, W] and ``name``; the last is optional, and those before may stand once for all
+    beside ``views``. nerfstudio's has ``frames``; distortion is left out.
+
+    Raises:
+        DataError: the file is missing, damaged, or lists no cameras; or a camera is none.
+    """
+    path = Path(path)
+    content = read_object(path)
+    if "views" not in content and "frames" not in content:
+        raise DataError(f"{path} has neither views nor frames: write cameras as docs/novel-view.md shows")
+    key = "views" if "views" in content else "frames"
+    listed = content[key]
+    if not isinstance(listed, list) or not listed or not all(isinstance(one, dict) for one in listed):
+        raise DataError(f"{path} lists no cameras under {key}: write at least one, as an object")
+    if len(listed) > MOST:
+        raise DataError(f"{path} lists {len(listed)} cameras, at most {MOST} are rendered: divide the list")
+    places = [f"{key}[{index}] of {path}" for index in range(len(listed))]
+    facts = [{**content, **one} for one in listed]
+    if key == "views":
+        lenses = [_lens(one, place) for one, place in zip(facts, places, strict=True)]
+        poses = [
+            numbers(one, "world_from_camera", place, (4, 4)) for one, place in zip(facts, places, strict=True)
+        ]
+    else:
+        lenses, poses = _nerfstudio(content, facts, places, path)
+    return CameraList(_names(listed, places), tuple(lenses), torch.from_numpy(_rigid(poses, places)))
+
+
+def _lens(facts: Mapping[str, Any], where: str) -> Lens:
+    try:
+        height, width = (int(side) for side in facts["image_size"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{where} has no image_size: write [height, width] in pixels") from error
+    try:
+        given = np.array(facts["intrinsics"], dtype=np.float64)
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{where} has no intrinsics: write [fx, fy, cx, cy] or a 3x3 matrix") from error
+    if given.shape == (3, 3):
+        skew = [given[0, 1], given[1, 0], given[2, 0], given[2, 1], given[2, 2] - 1]
+        if not np.abs(skew).max() < 1e-6:
+            raise DataError(
+                f"{where} has intrinsics that are no [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]: mend them"
+            )
+        given = given[[0, 1, 0, 1], [0, 1, 2, 2]]
+    if given.shape != (4,):
+        raise DataError(
+            f"{where} has intrinsics of {given.size} numbers: write [fx, fy, cx, cy] or a 3x3 matrix"
+        )
+    fx, fy, cx, cy = given.tolist()
+    return check_lens(Lens((height, width), (fx, fy), (cx, cy)), where)
+
+
+def _nerfstudio(
+    content: Mapping[str, Any], facts: Sequence[Mapping[str, Any]], places: Sequence[str], path: Path
+) -> tuple[list[Lens], list[NDArray[np.float64]]]:
+    undo = undo_applied(content, path)
+    lenses, poses = [], []
+    for one, place in zip(facts, places, strict=True):
+        lens = frame_lens(one, None, place)
+        lenses.append(Lens(lens.size, lens.focal, lens.center))
+        pose = frame_pose(one, undo, place)
+        pose[:3, :3] = pose[:3, :3] @ OPENGL
+        poses.append(pose)
+    return lenses, poses
+
+
+def _rigid(poses: Sequence[NDArray[np.float64]], places: Sequence[str]) -> NDArray[np.float64]:
+    stacked = np.array(poses)
+    for place, good in zip(places, are_rigid(stacked).tolist(), strict=True):
+        if not good:
+            raise DataError(
+                f"{place} has a pose that is no rotation and place, or not finite: mend or remove it"
+            )
+    stacked[:, 3] = [0, 0, 0, 1]
+    return stacked
+
+
+def _names(listed: Sequence[Mapping[str, Any]], places: Sequence[str]) -> tuple[str, ...]:
+    """Return the given names, or numbers for those without."""
+    digits = max(3, len(str(len(listed) - 1)))
+    names = [one.get("name", f"{index:0{digits}d}") for index, one in enumerate(listed)]
+    taken: dict[str, str] = {}
+    for name, place in zip(names, places, strict=True):
+        if not isinstance(name, str) or not _NAME.fullmatch(name) or name.endswith((".", " ")):
+            raise DataError(f"{place} has the name {str(name)[:50]!r}, no file name: use letters and digits")
+        # Some file systems take upper and lower case for the same.
+        if name.lower() in taken:
+            raise DataError(f"{place} has the name of {taken[name.lower()]}, {name!r}: give each its own")
+        taken[name.lower()] = place
+    return tuple(names)

@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Models out of checkpoints: the config inside says how to build them, the weights fill them."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import torch
+
+from raytran.checkpoints.content import FORMAT
+from raytran.checkpoints.file import read_checkpoint
+from raytran.checkpoints.known_data import KnownData
+from raytran.checkpoints.weights import checkpoint_path
+from raytran.checkpoints.weights_file import PREFIX
+from raytran.errors import CheckpointError
+from raytran.ops.tracer import RayTracer
+from raytran.ops.triton.dispatch import Attention
+
+if TYPE_CHECKING:
+    from raytran.model import RayTran
+
+
+def checkpoint_card(
+    *,
+    stage: str,
+    preset: str,
+    config: Mapping[str, Any],
+    parent: Mapping[str, Any] | None,
+    warnings: Sequence[str] = (),
+) -> dict[str, Any]:
+    """Return the plain Python that identifies a checkpoint.
+
+    Args:
+        stage: name of the stage.
+        preset: name of the preset.
+        config: all settings of the run, resolved; ``model`` rebuilds the network, ``views`` holds
+            ``image_size`` [H, W], ``num_views`` in training and ``predict_views``.
+        parent: the checkpoint that the fit started from, see ``Parent``, or None.
+        warnings: what anybody who uses the weights should know.
+    """
+    from raytran.checkpoints.provenance import git_commit, versions
+
+    return {
+        "format": FORMAT,
+        "stage": stage,
+        "preset": preset,
+        "model": copy.deepcopy(config["model"]),
+        "views": copy.deepcopy(config["views"]),
+        "config": copy.deepcopy(dict(config)),
+        "data": KnownData.of_config(config).as_plain(),
+        "input_mask": _input_mask(config),
+        "parent": None if parent is None else dict(parent),
+        "warnings": list(warnings),
+        "git_commit": git_commit(),
+        "versions": versions(),
+    }
+
+
+def _input_mask(config: Any) -> str | None:
+    """Return the mask that goes in as a fourth channel; checkpoints from before there were two say True."""
+    for name in ("data", "dataset", "input_mask"):
+        config = config.get(name) if isinstance(config, Mapping) else None
+    return "amodal" if config is True else config if isinstance(config, str) else None
+
+
+def load_model(
+    checkpoint: str | Path, *, attention: Attention = "auto", trust: Iterable[str] = ()
+) -> RayTran:
+    """Return the model of a checkpoint, in evaluation mode, on the CPU.
+
+    Args:
+        checkpoint: path of the file, or ``default`` for the weights that the package carries.
+        attention: as in ``RayTran``; what the network was trained with does not matter.
+        trust: packages of your own whose classes the file may name, see ``trusted_packages``.
+
+    Raises:
+        CheckpointError: the file is missing, damaged, or its weights do not fit the model described in it; or
+            that names a class of a package that is not trusted.
+        ConfigError: there is no such attention, or ``trust`` is no list of packages.
+    """
+    path = checkpoint_path(checkpoint)
+    model = model_from(read_checkpoint(path), path, trust=trust)
+    model.ray_tracer = RayTracer(attention)
+    return model
+
+
+@dataclass(frozen=True)
+class PredictionSettings:
+    """What a checkpoint says about the images it wants.
+
+    Attributes:
+        preset: name of the preset it was trained with.
+        stage: name of the stage.
+        image_size: ``(H, W)``.
+        num_views: frames to predict from (96 in the paper).
+        input_mask: mask that goes in as a fourth channel, see ``SceneDataset``; None if that is not known.
+    """
+
+    preset: str
+    stage: str
+    image_size: tuple[int, int]
+    num_views: int
+    input_mask: str | None = None
+
+
+def prediction_settings(checkpoint: str | Path) -> PredictionSettings:
+    """Read how a checkpoint is to be used.
+
+    Args:
+        checkpoint: path of the file, or ``default`` for the weights that the package carries.
+
+    Raises:
+        CheckpointError: the file is missing or damaged.
+    """
+    path = checkpoint_path(checkpoint)
+    card = read_checkpoint(path)
+    views = card["views"]
+    try:
+        height, width = map(int, views["image_size"])
+        num_views = int(views["predict_views"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(f"{path} does not say which images its network wants: it is damaged") from error
+    mask = card.get("input_mask") or _input_mask(card.get("config"))
+    return PredictionSettings(card["preset"], card["stage"], (height, width), num_views, mask)
+
+
+def model_from(checkpoint: Mapping[str, Any], path: Path, *, trust: Iterable[str] = ()) -> RayTran:
+    """Return the model of a checkpoint that was read from ``path`` already.
+
+    Args:
+        checkpoint: what ``read_checkpoint`` returned.
+        path: where from, for messages.
+        trust: packages of your own whose classes it may name, see ``trusted_packages``.
+
+    Raises:
+        CheckpointError: the checkpoint describes no network of raytran or of a trusted package, or its
+            weights do not fit.
+        ConfigError: ``trust`` is no list of packages.
+    """
+    from raytran.checkpoints.network import build_network
+    from raytran.model import RayTran
+
+    with torch.device("meta"):  # the file's size, and not what it claims, decides how much memory is taken
+        shell = build_network(checkpoint["model"], path, trust=trust)
+    if not isinstance(shell, RayTran):
+        raise CheckpointError(f"{path} describes only a part of a network: do not use this file")
+    load_weights(shell, checkpoint, path, assign=True)
+    model = cast("RayTran", build_network(checkpoint["model"], path, trust=trust))
+    load_weights(model, checkpoint, path)
+    return model.eval()
+
+
+def load_weights(
+    model: RayTran,
+    checkpoint: Mapping[str, Any],
+    path: Path,
+    *,
+    assign: bool = False,
+    afresh: Sequence[str] = (),
+) -> None:
+    """Fill ``model`` with the weights of a checkpoint.
+
+    Args:
+        model: the network.
+        checkpoint: what ``read_checkpoint`` returned.
+        path: where from, for messages.
+        assign: take the checkpoint's tensors themselves, instead of copying into those of ``model``.
+        afresh: parts that keep the weights they have, see ``parts_afresh``.
+
+    Raises:
+        CheckpointError: names or shapes differ.
+    """
+    kept = tuple(f"{part}." for part in afresh)
+    state = {name: value for name, value in _state(checkpoint).items() if not name.startswith(kept)}
+    state |= {name: value for name, value in model.state_dict().items() if name.startswith(kept)}
+    try:
+        model.load_state_dict(state, assign=assign)
+    except RuntimeError as error:
+        reason = str(error).splitlines()[-1].strip()
+        raise CheckpointError(
+            f"the weights in {path} (preset {checkpoint['preset']}) do not fit this model ({reason}): "
+            "choose the preset and model settings that the checkpoint was trained with"
+        ) from error
+
+
+def parts_afresh(model: RayTran, checkpoint: Mapping[str, Any], begins: Sequence[str]) -> list[str]:
+    """Return the parts of ``model`` that a stage starts at random although it has a parent.
+
+    Those are the parts in ``begins`` of which the checkpoint has nothing, and the heads that are of another
+    form than the checkpoint's, if those are as random: it has no parent, and its stage did not train them.
+    So one stage 1 does for all object heads.
+
+    Args:
+        model: the network.
+        checkpoint: what ``read_checkpoint`` returned.
+        begins: parts that may be missing from the checkpoint.
+    """
+    state = {name: value.shape for name, value in _state(checkpoint).items()}
+    wanted = {name: value.shape for name, value in model.state_dict().items()}
+
+    def within(part: str, shapes: dict[str, torch.Size]) -> dict[str, torch.Size]:
+        return {name: shape for name, shape in shapes.items() if name.startswith(f"{part}.")}
+
+    missing = [part for part in begins if not within(part, state)]
+    heads = [f"heads.{head}" for head in model.heads]
+    other = [head for head in heads if within(head, state) not in ({}, within(head, wanted))]
+    return missing + [head for head in other if _is_random(head, checkpoint)]
+
+
+def _is_random(part: str, checkpoint: Mapping[str, Any]) -> bool:
+    """Say whether ``part`` of a checkpoint was never trained, as far as the checkpoint tells."""
+    try:
+        if checkpoint["parent"] is not None:
+            return False
+        trained = [f"{name}." for name in checkpoint["config"]["stage"]["trainable"]]
+    except (KeyError, TypeError):
+        return False
+    return not any(name.startswith(f"{part}.") or f"{part}.".startswith(name) for name in trained)
+
+
+def _state(checkpoint: Mapping[str, Any]) -> dict[str, torch.Tensor]:
+    """Return the network's weights in a checkpoint by their names in the network."""
+    return {
+        name.removeprefix(PREFIX): value
+        for name, value in checkpoint["state_dict"].items()
+        if name.startswith(PREFIX)
+    }

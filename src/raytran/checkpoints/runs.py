@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The folders of runs: where a new one goes, which one to continue, which finished stage to start from.
+
+A run lives in ``<outputs>/<preset>/<experiment>/<time>``. It holds ``checkpoints/last.ckpt`` and the one
+before it while it goes on and, once its last step is done, ``finished.json``.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from raytran.checkpoints.launched import name_by_time
+from raytran.data.atomic import write_json
+from raytran.errors import CheckpointError, ConfigError
+
+_log = logging.getLogger(__name__)
+
+LAST = Path("checkpoints") / "last.ckpt"
+PREVIOUS = LAST.with_name("previous.ckpt")
+FINISHED = "finished.json"
+_LOCK = ".lock"
+
+
+@dataclass(frozen=True)
+class Finished:
+    """What ``finished.json`` says.
+
+    Attributes:
+        stage: name of the stage that was trained.
+        preset: the preset.
+        experiment: the experiment.
+        checkpoint: path of the final checkpoint, relative to the run's folder.
+        steps: optimiser steps taken.
+        time: when it finished, UTC, ISO 8601.
+        data: what it was trained on, see ``KnownData``; None for a curriculum, and for runs from before this
+            was written down.
+    """
+
+    stage: str
+    preset: str
+    experiment: str
+    checkpoint: str
+    steps: int
+    time: str
+    data: dict[str, Any] | None = None
+
+
+@contextmanager
+def one_at_a_time(folder: Path) -> Iterator[int]:
+    """Keep other processes from training in ``folder`` until the block ends or this process is killed.
+
+    Gives the descriptor of the lock. A process that inherits it keeps the folder too.
+
+    Raises:
+        ConfigError: one does already.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with (folder / _LOCK).open("a") as file:
+        try:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ConfigError(
+                f"another process trains in {folder}: wait for it to end, or stop it, and try again"
+            ) from error
+        except (ImportError, OSError) as error:
+            # Windows, and some network disks: there it is for the user not to start two.
+            _log.debug("cannot lock %s: %s", folder, error)
+        yield file.fileno()
+
+
+def write_finished(
+    folder: Path,
+    *,
+    stage: str,
+    preset: str,
+    experiment: str,
+    steps: int,
+    data: dict[str, Any] | None = None,
+) -> Finished:
+    """Mark the run in ``folder`` as finished and return the mark."""
+    now = datetime.now(UTC).isoformat()
+    mark = Finished(stage, preset, experiment, LAST.as_posix(), steps, now, data)
+    write_json(folder / FINISHED, asdict(mark))
+    return mark
+
+
+def read_finished(folder: Path) -> Finished | None:
+    """Return the mark of the run in ``folder``, None if it has not finished.
+
+    Raises:
+        CheckpointError: the file is damaged.
+    """
+    path = folder / FINISHED
+    if not path.is_file():
+        return None
+    try:
+        return Finished(**json.loads(path.read_text()))
+    except (ValueError, TypeError) as error:
+        raise CheckpointError(
+            f"{path} is damaged: delete it and run that stage again with resume=auto"
+        ) from error
+
+
+def finished_runs(
+    outputs: Path, *, preset: str, stage: str, experiment: str | None = None
+) -> list[tuple[Path, Finished]]:
+    """Return the checkpoints of the finished runs of ``stage`` with ``preset`` and their marks, newest first.
+
+    Args:
+        outputs: top folder of all runs.
+        preset: the preset.
+        stage: name of the stage.
+        experiment: the experiment; None for any. Networks of two experiments may differ (a fourth channel).
+    """
+    found = []
+    for path in (outputs / preset).glob(f"**/{FINISHED}"):
+        mark = read_finished(path.parent)
+        if mark is None or (mark.stage, mark.preset) != (stage, preset):
+            continue
+        if experiment in (None, mark.experiment):
+            checkpoint = path.parent / mark.checkpoint
+            if checkpoint.is_file():
+                found.append((checkpoint, mark))
+    return sorted(found, key=lambda run: (run[1].time, run[0]), reverse=True)
+
+
+def newest_unfinished(parent: Path, holds: Path) -> Path | None:
+    """Return the newest folder in ``parent`` that has the file ``holds`` but no ``finished.json``.
+
+    A checkpoint that is gone counts as long as the one before it is there.
+    """
+    if not parent.is_dir():
+        return None
+    names = [LAST, PREVIOUS] if holds == LAST else [holds]
+    found = [
+        (path.stat().st_mtime, folder)
+        for folder in parent.iterdir()
+        for path in (folder / name for name in names)
+        if path.is_file() and not (folder / FINISHED).exists()
+    ]
+    return max(found)[1] if found else None
+
+
+def run_folder(outputs: str, preset: str, experiment: str, resume: str, holds: str = LAST.as_posix()) -> str:
+    """Return the folder for a run: that of the run to continue, or a new one named by the time.
+
+    Args:
+        outputs: top folder of all runs.
+        preset: the preset.
+        experiment: the experiment.
+        resume: ``none``, ``auto``, or a checkpoint inside the folder of the run to continue.
+        holds: the file that tells a folder worth continuing.
+
+    Raises:
+        ConfigError: ``resume`` names a file that is not the checkpoint of a run.
+    """
+    parent = Path(outputs) / preset / experiment
+    if resume == "auto":
+        unfinished = newest_unfinished(parent, Path(holds))
+        if unfinished is not None:
+            return str(unfinished)
+    elif resume != "none":
+        checkpoint = Path(resume)
+        if checkpoint.parent.name != LAST.parent.name:
+            raise ConfigError(
+                f"resume={resume} is not inside the folder of a run (…/checkpoints/last.ckpt): "
+                "give resume=auto, or init_from=CHECKPOINT to start a new run from its weights"
+            )
+        return str(checkpoint.parent.parent)
+    return str(parent / name_by_time())

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which of ScanNet's exported forms a folder has, and where its images, poses and intrinsics lie."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from raytran.data.scannet.text import INFO_FILES
+from raytran.errors import DataError
+
+FORMS: tuple[str, ...] = ("exporter", "cpp", "odam", "mmdetection3d", "frames_25k")
+"""Exported forms, the one to prefer first.
+
+``exporter``: ScanNet's Python exporter, ``color/<n>.jpg``, ``pose/<n>.txt``, ``intrinsic/``. ``cpp``: its C++
+tool, ``frame-<n>.color.jpg``, ``frame-<n>.pose.txt``, ``_info.txt``. ``odam``: the first, inside ``frames/``.
+``mmdetection3d``: ``<n>.jpg``, ``<n>.txt``, ``intrinsic.txt``. ``frames_25k``: every 100th frame, ``color/``,
+``pose/``, ``intrinsics_color.txt``.
+"""
+
+WANTED = (
+    "wanted are color/<n>.jpg with pose/<n>.txt and intrinsic/intrinsic_color.txt, frame-<n>.color.jpg with "
+    "frame-<n>.pose.txt and _info.txt, <n>.jpg with <n>.txt and intrinsic.txt, or a .sens file"
+)
+
+INNER_FOLDERS = ("frames", "sequence", "sensor_data", "exported", "data")
+"""Names of folders inside a scan that hold its frames."""
+
+_INTRINSICS = (
+    "intrinsic/intrinsic_color.txt",
+    "intrinsics/intrinsic_color.txt",
+    "intrinsics_color.txt",
+    "intrinsic_color.txt",
+    "intrinsic.txt",
+    *INFO_FILES,
+)
+_IMAGE_ENDINGS = (".png", ".jpeg", ".jpg")
+"""Where a frame comes in several, the last one counts."""
+_CPP_FRAME = re.compile(r"frame-(\d+)\.(color|pose)\.(\w+)")
+_FLAT_FRAME = re.compile(r"(\d+)\.(\w+)")
+
+
+@dataclass(frozen=True)
+class Listing:
+    """Names of the folders and files in a folder; hidden ones are left out."""
+
+    path: Path
+    folders: frozenset[str]
+    files: frozenset[str]
+
+    @classmethod
+    def of(cls, path: Path) -> Listing:
+        """Read a folder.
+
+        Raises:
+            DataError: it cannot be read.
+        """
+        folders: set[str] = set()
+        files: set[str] = set()
+        try:
+            with os.scandir(path) as entries:
+                for entry in entries:
+                    if not entry.name.startswith("."):
+                        (folders if entry.is_dir() else files).add(entry.name)
+        except OSError as error:
+            raise DataError(f"cannot read the folder {path} ({error.strerror}): check the path") from error
+        return cls(path, frozenset(folders), frozenset(files))
+
+    def summary(self) -> str:
+        """Return what the folder holds, in a few words."""
+        endings = Counter(Path(name).suffix or "without ending" for name in self.files)
+        parts = [f"the folder {name}" for name in sorted(self.folders)[:6]]
+        parts += ["more folders"] if len(self.folders) > 6 else []
+        parts += [f"{count} files {ending}" for ending, count in endings.most_common(4)]
+        return ", ".join(parts) or "nothing"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the parts of an exported scan lie.
+
+    Attributes:
+        form: one of ``FORMS``.
+        scan: the scan's folder.
+        base: the folder of the frames: the scan's, or one inside it.
+    """
+
+    form: str
+    scan: Path
+    base: Path
+
+    def images(self) -> dict[str, Path]:
+        """Return the colour image of each frame, by the frame's name."""
+        if self.form == "cpp":
+            return self._cpp("color", _IMAGE_ENDINGS)
+        if self.form == "mmdetection3d":
+            files = self._flat(_IMAGE_ENDINGS)
+            # Beside the JPEGs, PNGs are depth maps.
+            jpegs = {name: path for name, path in files.items() if path.suffix.lower() != ".png"}
+            return jpegs or files
+        return _by_stem(self.base / "color", _IMAGE_ENDINGS)
+
+    def poses(self) -> dict[str, Path]:
+        """Return the pose file of each frame, by the frame's name."""
+        if self.form == "cpp":
+            return self._cpp("pose", (".txt",))
+        return (
+            self._flat((".txt",)) if self.form == "mmdetection3d" else _by_stem(self.base / "pose", (".txt",))
+        )
+
+    def intrinsics(self) -> Path:
+        """Return the first file of intrinsics that is there, or where the exporter would write it."""
+        folders = dict.fromkeys((self.base, self.scan))
+        found = (folder / name for folder in folders for name in _INTRINSICS if (folder / name).is_file())
+        return next(found, self.base / _INTRINSICS[0])
+
+    def num_images(self) -> int:
+        """Return the number of colour images without opening any."""
+        return len(self.images())
+
+    def _cpp(self, part: str, endings: tuple[str, ...]) -> dict[str, Path]:
+        matches = (_CPP_FRAME.fullmatch(name) for name in Listing.of(self.base).files)
+        wanted = ((m, f".{m[3].lower()}") for m in matches if m and m[2] == part)
+        return _pick(endings, ((m[1], self.base / m.string, ending) for m, ending in wanted))
+
+    def _flat(self, endings: tuple[str, ...]) -> dict[str, Path]:
+        matches = (_FLAT_FRAME.fullmatch(name) for name in Listing.of(self.base).files)
+        return _pick(endings, ((m[1], self.base / m.string, f".{m[2].lower()}") for m in matches if m))
+
+
+def recognise(listing: Listing) -> Layout | None:
+    """Return the layout of a scan's folder, or None if it holds no frames.
+
+    A part may still be missing: a folder with images but no poses is recognised, so that reading it names
+    what is not there.
+    """
+    own = _form(listing)
+    if own is not None:
+        return Layout(own, listing.path, listing.path)
+    for name in INNER_FOLDERS:
+        if name in listing.folders:
+            inner = Listing.of(listing.path / name)
+            form = _form(inner)
+            if form is not None:
+                return Layout("odam" if form == "exporter" else form, listing.path, inner.path)
+    return None
+
+
+def find_layout(folder: Path) -> Layout:
+    """Return the layout of a scan's folder.
+
+    Raises:
+        DataError: there is no such folder, or it holds no frames in a known form.
+    """
+    if not folder.is_dir():
+        raise DataError(f"there is no scan folder {folder}: check the path")
+    listing = Listing.of(folder)
+    layout = recognise(listing)
+    if layout is None:
+        raise DataError(f"{folder} holds {listing.summary()}, so no frames of a scan: {WANTED}")
+    return layout
+
+
+def _form(listing: Listing) -> str | None:
+    if {"color", "pose"} & listing.folders:
+        return "frames_25k" if "intrinsics_color.txt" in listing.files else "exporter"
+    if any(_CPP_FRAME.fullmatch(name) for name in listing.files):
+        return "cpp"
+    if "intrinsic.txt" in listing.files and any(
+        match[2] == "txt" for match in map(_FLAT_FRAME.fullmatch, listing.files) if match
+    ):
+        return "mmdetection3d"
+    return None
+
+
+def _by_stem(folder: Path, endings: tuple[str, ...]) -> dict[str, Path]:
+    if not folder.is_dir():
+        raise DataError(f"{folder.parent} has no folder {folder.name}: {WANTED}")
+    paths = (folder / name for name in Listing.of(folder).files)
+    return _pick(endings, ((path.stem, path, path.suffix.lower()) for path in paths))
+
+
+def _pick(endings: tuple[str, ...], files: Iterable[tuple[str, Path, str]]) -> dict[str, Path]:
+    """Return the path of each name; of several endings, the one that comes last in ``endings``."""
+    fitting = [(endings.index(ending), name, path) for name, path, ending in files if ending in endings]
+    return {name: path for _, name, path in sorted(fitting)}

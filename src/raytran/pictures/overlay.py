@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Predicted objects drawn over the frames they were seen in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from PIL import Image, ImageDraw
+from torch import Tensor
+
+from raytran.data.views import choose_even
+from raytran.geometry.camera import Cameras
+from raytran.geometry.rasterize import rasterize_ids
+from raytran.pictures.palette import font, ink_on
+from raytran.pictures.wireframe import box_segments
+from raytran.structs import CLASS_COLORS, CLASSES, ObjectSet, ScenePrediction, Views
+
+_FILL = 0.5
+_OVERSAMPLING = 2
+
+
+def draw_overlays(
+    folder: Path,
+    views: Views,
+    frame_ids: Sequence[str],
+    prediction: ScenePrediction,
+    meshes: Sequence[trimesh.Trimesh | None],
+    *,
+    count: int = 4,
+    min_height: int = 360,
+) -> list[Path]:
+    """Write ``<frame>.jpg`` for a few frames spread evenly over the walk.
+
+    Boxes are wireframes with the front face drawn bold; meshes are translucent fills; both in class colours.
+
+    Args:
+        folder: made if it is missing.
+        views: one scene, B = 1.
+        frame_ids: the name of each of the ``N`` frames.
+        prediction: ``M`` objects.
+        meshes: for each object its mesh in world coordinates, or None.
+        count: how many frames; all of them if there are fewer.
+        min_height: smaller frames are enlarged to this many rows, so that names can be read.
+
+    Returns:
+        The pictures in the order of the walk.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for n in dict.fromkeys(choose_even(len(frame_ids), min(count, len(frame_ids))).tolist()):
+        frame = frame_image(views, n)
+        camera = Cameras(views.intrinsics[0, n], views.world_from_camera[0, n], views.image_size)
+        if frame.height < min_height:
+            size = (min_height, round(frame.width * min_height / frame.height))
+            frame, camera = frame.resize(size[::-1], Image.Resampling.BICUBIC), camera.scaled_to(size)
+        picture = draw_objects(frame, camera, prediction.objects, meshes)
+        paths.append(folder / f"{frame_ids[n]}.jpg")
+        picture.save(paths[-1], quality=92)
+    return paths
+
+
+def frame_image(views: Views, index: int) -> Image.Image:
+    """Return the RGB picture of frame ``index`` of the first scene."""
+    pixels = views.images[0, index, :3].cpu()
+    if pixels.is_floating_point():
+        pixels = (pixels * 255).round().clamp(0, 255).to(torch.uint8)
+    return Image.fromarray(pixels.permute(1, 2, 0).numpy())
+
+
+def draw_objects(
+    frame: Image.Image, camera: Cameras, objects: ObjectSet, meshes: Sequence[trimesh.Trimesh | None]
+) -> Image.Image:
+    """Return ``frame`` with objects drawn over it.
+
+    Args:
+        frame: a picture of the camera's image size.
+        camera: no leading dimensions.
+        objects: ``M`` objects.
+        meshes: for each object its mesh in world coordinates, or None.
+    """
+    filled = _fill_meshes(np.asarray(frame), camera, objects, meshes)
+    large = Image.fromarray(filled).resize(
+        (frame.width * _OVERSAMPLING, frame.height * _OVERSAMPLING), Image.Resampling.BICUBIC
+    )
+    pen = ImageDraw.Draw(large)
+    segments = box_segments(objects, camera)
+    camera_from_object = (objects.center - camera.position.to(objects.center)).norm(dim=-1)
+    far_first = camera_from_object.argsort(descending=True).tolist()
+    for m in far_first:
+        color = CLASS_COLORS[int(objects.label[m])]
+        for u0, v0, u1, v1, front in segments[m]:
+            line = [_OVERSAMPLING * value for value in (u0, v0, u1, v1)]
+            pen.line(line, fill=color, width=_OVERSAMPLING * (3 if front else 1) + 1)
+    picture = large.resize(frame.size, Image.Resampling.BOX)
+    pen = ImageDraw.Draw(picture)
+    for m in far_first:
+        _write_name(pen, frame.size, segments[m], int(objects.label[m]), float(objects.score[m]))
+    return picture
+
+
+def _fill_meshes(
+    image: np.ndarray, camera: Cameras, objects: ObjectSet, meshes: Sequence[trimesh.Trimesh | None]
+) -> np.ndarray:
+    shown = [(i, mesh) for i, mesh in enumerate(meshes) if mesh is not None and len(mesh.faces)]
+    if not shown:
+        return image
+    one = Cameras(camera.intrinsics[None], camera.world_from_camera[None], camera.image_size)
+    ids, depth = (result[0] for result in rasterize_ids([(m.vertices, m.faces) for _, m in shown], one))
+    colors = torch.tensor(CLASS_COLORS)[objects.label[[i for i, _ in shown]].cpu()]
+    covered = ids >= 0
+    edge = torch.zeros_like(covered)
+    edge[:, 1:] |= ids[:, 1:] != ids[:, :-1]
+    edge[1:] |= ids[1:] != ids[:-1]
+    share = torch.where(edge, 0.9, _FILL)[covered][:, None]
+    directions = camera.cell_rays(camera.image_size)[1][..., 0, :]
+    light = torch.where(edge, 1.0, headlight(depth, directions))[covered][:, None]
+    result = torch.from_numpy(image.astype(np.float32))
+    result[covered] = (1 - share) * result[covered] + share * light * colors[ids[covered]]
+    return result.round().to(torch.uint8).numpy()
+
+
+def headlight(depth: Tensor, directions: Tensor) -> Tensor:
+    """Return light by how squarely surfaces face the camera, ``(H, W)`` in [0.55, 1.1], from depths alone.
+
+    Args:
+        depth: ``(H, W)`` along the camera's z axis, metres; infinite where there is no surface.
+        directions: ``(H, W, 3)`` of the pixels' rays, of unit depth, in any frame.
+    """
+    points = directions * depth.nan_to_num(posinf=0.0)[..., None].to(directions)
+    right, down = torch.gradient(points, dim=(1, 0))
+    normal = torch.nn.functional.normalize(torch.linalg.cross(right, down), dim=-1)
+    sight = torch.nn.functional.normalize(directions, dim=-1)
+    return (0.55 + 0.55 * (normal * sight).sum(dim=-1).abs()).float()
+
+
+def _write_name(
+    pen: ImageDraw.ImageDraw,
+    size: tuple[int, int],
+    segments: Sequence[tuple[float, float, float, float, bool]],
+    label: int,
+    score: float,
+) -> None:
+    ends = np.array([end for u0, v0, u1, v1, _ in segments for end in ((u0, v0), (u1, v1))]).reshape(-1, 2)
+    low, high = (
+        (ends.min(axis=0), ends.max(axis=0)) if len(ends) else (np.full(2, np.inf), np.full(2, -np.inf))
+    )
+    width, height = size
+    if low[0] >= width or low[1] >= height or high[0] <= 0 or high[1] <= 0:
+        return
+    text, type_face = f"{CLASSES[label]} {score:.2f}", font(max(13, height // 26))
+    left, top, right, bottom = pen.textbbox((0, 0), text, font=type_face)
+    middle = (max(low[0], 0) + min(high[0], width)) / 2
+    x = float(np.clip(middle - (right - left) / 2, 2, max(width - (right - left) - 4, 2)))
+    y = float(np.clip(low[1] - (bottom - top) - 4, 2, height - (bottom - top) - 4))
+    color = CLASS_COLORS[label]
+    pen.rectangle([x - 2, y - 1, x + right - left + 2, y + bottom - top + 3], fill=color)
+    pen.text((x - left, y - top + 1), text, font=type_face, fill=ink_on(color))

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The embedded default data: rooms that are made when training or evaluation first asks for them."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from raytran.rooms.benchmark import generate_rooms_v1
+from raytran.rooms.generate import generate_rooms
+
+_log = logging.getLogger(__name__)
+
+LISTS = ("scannetv2_train.txt", "scannetv2_val.txt")
+LISTS_V1 = (*LISTS, "scannetv2_test.txt")
+
+
+def ensure_rooms(output: Path, **settings: Any) -> None:
+    """Make the rooms in ``output`` unless a whole set is there, which is then used as it is.
+
+    Args:
+        output: the data set.
+        settings: arguments of ``generate_rooms``.
+
+    Raises:
+        DataError: a set with other settings was begun there.
+        ConfigError: the settings contradict each other.
+    """
+    output = Path(output)
+    if rooms_are_complete(output):
+        found = json.loads((output / "rooms.json").read_text(encoding="utf-8"))
+        asked = json.loads(json.dumps(settings))
+        other = [f"{name}={found[name]}" for name in asked if name in found and found[name] != asked[name]]
+        if other:
+            _log.warning("using the rooms in %s as they are, made with %s", output, " ".join(other))
+        return
+    count = settings["num_train"] + settings["num_val"]
+    _log.info("making %d rooms in %s (first use; an interrupted set is completed)", count, output.resolve())
+    generate_rooms(output, **settings)
+
+
+def ensure_rooms_v1(
+    output: Path, *, num_train: int, num_val: int, num_test: int, processes: int = 0, progress: bool = True
+) -> None:
+    """Make rooms-v1 in ``output`` unless at least as many rooms are there, which are then used as they are.
+
+    Args:
+        output: the data set.
+        num_train: training rooms.
+        num_val: validation rooms.
+        num_test: test rooms.
+        processes: worker processes, 0 for one per core.
+        progress: show a progress bar.
+
+    Raises:
+        DataError: other rooms are there.
+        ConfigError: a number is too large.
+    """
+    output = Path(output)
+    asked = (num_train, num_val, num_test)
+    if rooms_are_complete(output, LISTS_V1):
+        there = [len(_scans(output, name)) for name in LISTS_V1]
+        if all(found >= count for found, count in zip(there, asked, strict=True)):
+            return
+    count = sum(asked)
+    _log.info("making %d rooms in %s (first use; an interrupted set is completed)", count, output.resolve())
+    generate_rooms_v1(
+        output,
+        num_train=num_train,
+        num_val=num_val,
+        num_test=num_test,
+        processes=processes,
+        progress=progress,
+    )
+
+
+def rooms_are_complete(output: Path, lists: Sequence[str] = LISTS) -> bool:
+    """Say whether ``output`` holds a whole set of rooms: the lists, written last, and every scan in them."""
+    if not all((output / name).is_file() for name in ("rooms.json", *(f"scannet/{name}" for name in lists))):
+        return False
+    return all(
+        (output / "scannet" / "scans" / scan).is_dir() for name in lists for scan in _scans(output, name)
+    )
+
+
+def _scans(output: Path, name: str) -> list[str]:
+    return (output / "scannet" / name).read_text(encoding="utf-8").split()

@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: Apache-2.0
+"""CAD models of a folder in ShapeNet's layout, looked through once to furnish rooms with them."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import Counter
+from dataclasses import asdict, dataclass
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from raytran.data.atomic import write_json
+from raytran.data.shapenet.colors import read_face_colors
+from raytran.data.shapenet.models import mesh_path, model_names, read_mesh
+from raytran.data.workers import work_on
+from raytran.errors import DataError
+from raytran.rooms.cad import CadModel
+from raytran.rooms.kinds import KINDS
+from raytran.rooms.sizes import KNOWN_CATIDS, draw_size, guess_kind
+from raytran.rooms.symmetry import measure_symmetry
+from raytran.structs import CLASS_BY_CATID
+
+MODELS_PER_CATEGORY = 150
+"""Models of one synset that are looked at; of more, these are chosen by their names' hashes."""
+
+MOST_FACES = 100_000
+"""Models with more triangles are left out: a few of them in a room slow every step down."""
+
+SPLITS = ("train", "val")
+
+_HELD_OUT_SHARE = 0.2
+_THINNEST = 0.003
+
+
+@dataclass(frozen=True)
+class LibraryModel:
+    """What a room's layout asks of a CAD model before it is read.
+
+    Attributes:
+        catid: ShapeNet's synset.
+        model_id: ShapeNet's name of the model.
+        category: one of ``raytran.structs.CLASSES``.
+        kind: name in ``KINDS``.
+        symmetry: as in ``CadModel``, as the model's ``.json`` says or as measured.
+        size_m: real size along the object's axes, metres; drawn if the ``.json`` does not tell.
+        split: ``train`` or ``val``, of the rooms that may hold it.
+    """
+
+    catid: str
+    model_id: str
+    category: str
+    kind: str
+    symmetry: int
+    size_m: tuple[float, float, float]
+    split: str
+
+
+@dataclass(frozen=True)
+class CadLibrary:
+    """CAD models for rooms.
+
+    Attributes:
+        root: the folder in ShapeNet's layout.
+        models: those that can be used, by synset and name.
+        left_out: ``catid/id`` of the others that were looked at, with the reason.
+        digest: names all models in the folder, used or not.
+    """
+
+    root: Path
+    models: tuple[LibraryModel, ...]
+    left_out: dict[str, str]
+    digest: str
+
+    def load(self, model: LibraryModel) -> CadModel:
+        """Read one of ``models``.
+
+        Raises:
+            DataError: its file was changed or lost meanwhile.
+        """
+        return _load(self.root, model)
+
+
+def list_models(root: Path) -> list[tuple[str, str]]:
+    """Return synset and name of every model below ``root`` whose synset rooms are furnished from.
+
+    Raises:
+        DataError: there is none.
+    """
+    found = [(catid, name) for catid in sorted(KNOWN_CATIDS) for name in model_names(root, catid)]
+    if not found:
+        raise DataError(
+            f"no CAD model of furniture lies in {root}; give a folder of ShapeNetCore, or one made by "
+            "prepare dataset=cads"
+        )
+    return found
+
+
+def digest_of(names: list[tuple[str, str]]) -> str:
+    """Return what ``CadLibrary.digest`` holds."""
+    return hashlib.sha256("\n".join("/".join(name) for name in names).encode()).hexdigest()[:16]
+
+
+def survey(root: Path, *, processes: int = 0, progress: bool = True) -> CadLibrary:
+    """Look through the models of a folder: which can be used, how large and how symmetric they are.
+
+    Args:
+        root: folder in ShapeNet's layout.
+        processes: worker processes, 0 for one per core.
+        progress: show a progress bar.
+
+    Raises:
+        DataError: there is no model that can be used.
+    """
+    names = list_models(root)
+    chosen = [name for catid in KNOWN_CATIDS for name in _chosen([n for n in names if n[0] == catid])]
+    results = dict(
+        work_on(chosen, partial(_examine, root), label="CADs", processes=processes, progress=progress)
+    )
+    models = tuple(found for name in sorted(chosen) if isinstance(found := results[name], LibraryModel))
+    left_out = {"/".join(name): why for name in sorted(chosen) if isinstance(why := results[name], str)}
+    if not models:
+        name, why = next(iter(left_out.items()))
+        raise DataError(f"none of the {len(left_out)} CAD models in {root} can be used; {name}: {why}")
+    return CadLibrary(root, models, left_out, digest_of(names))
+
+
+def write_library(library: CadLibrary, path: Path) -> None:
+    """Write what ``survey`` found, without the folder's path."""
+    counts = Counter(f"{model.split} {model.category}" for model in library.models)
+    write_json(
+        path,
+        {
+            "digest": library.digest,
+            "counts": dict(sorted(counts.items())),
+            "left_out": library.left_out,
+            "models": [asdict(model) for model in library.models],
+        },
+    )
+
+
+@lru_cache(maxsize=4)
+def read_library(path: Path, root: Path) -> CadLibrary:
+    """Read what ``write_library`` wrote of the models in ``root``.
+
+    Raises:
+        DataError: the file is missing or damaged.
+    """
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        models = tuple(
+            LibraryModel(**(model | {"size_m": tuple(model["size_m"])})) for model in values["models"]
+        )
+        return CadLibrary(root, models, values["left_out"], values["digest"])
+    except OSError as error:
+        raise DataError(f"cannot read {path}: {error.strerror}; give the same command again") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path} is damaged ({error}); remove it and give the same command again") from error
+
+
+def _chosen(names: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    return sorted(names, key=_hash_of)[:MODELS_PER_CATEGORY]
+
+
+def _hash_of(name: tuple[str, str]) -> int:
+    return int.from_bytes(hashlib.sha256("/".join(name).encode()).digest()[:8], "big")
+
+
+def _examine(root: Path, name: tuple[str, str]) -> tuple[tuple[str, str], LibraryModel | str]:
+    """Return a model's name with what is known of it, or with why it cannot be used."""
+    try:
+        return name, _model(root, *name)
+    except DataError as error:
+        return name, str(error)
+
+
+def _model(root: Path, catid: str, model_id: str) -> LibraryModel:
+    mesh, path = read_mesh(root, catid, model_id), mesh_path(root, catid, model_id)
+    extent, count = np.ptp(mesh.vertices, axis=0), len(mesh.faces)
+    if count > MOST_FACES:
+        raise DataError(f"{path} has {count:,} triangles, more than {MOST_FACES:,}; simplify it to use it")
+    if abs(np.linalg.norm(extent) - 1) > 0.01:
+        raise DataError(f"{path} is not normalised: the diagonal of its box is not 1; scale it")
+    if extent.min() < _THINNEST:
+        raise DataError(f"{path} is flat; a box needs three sides")
+    facts = _facts(path)
+    rng = np.random.default_rng(_hash_of((catid, model_id)))
+    kind = facts.get("kind")
+    if kind not in KINDS or KINDS[kind].catid != catid:
+        kind = guess_kind(catid, extent.tolist())
+    size = _told_size(facts)
+    drawn = draw_size(catid, extent, rng) if size is None else size
+    held_out = rng.random() < _HELD_OUT_SHARE
+    symmetry = facts.get("symmetry")
+    if symmetry not in (0, 1, 2, 4):
+        group, colors = read_face_colors(path, count)
+        symmetry = measure_symmetry(mesh.vertices, mesh.faces, colors[group])
+    return LibraryModel(
+        catid=catid,
+        model_id=model_id,
+        category=CLASS_BY_CATID.get(catid, "other"),
+        kind=kind,
+        symmetry=symmetry,
+        # One factor takes the normalised model to its real size: its diagonal in metres.
+        size_m=tuple((extent / np.linalg.norm(extent) * np.linalg.norm(drawn)).round(6).tolist()),
+        split=facts["split"] if facts.get("split") in SPLITS else SPLITS[held_out],
+    )
+
+
+def _facts(path: Path) -> dict[str, Any]:
+    """Return a model's ``.json``, empty if it has none that can be read."""
+    try:
+        facts = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return facts if isinstance(facts, dict) else {}
+
+
+def _told_size(facts: dict[str, Any]) -> np.ndarray | None:
+    """Return the real size that a ``.json`` in metres tells, None for ShapeNet's, which are in any unit."""
+    if facts.get("unit") != "m":
+        return None
+    try:
+        size = np.subtract(facts["max"], facts["min"]).astype(np.float64)
+    except (KeyError, TypeError, ValueError):
+        return None
+    return size if size.shape == (3,) and np.isfinite(size).all() and (size > 0).all() else None
+
+
+@lru_cache(maxsize=128)
+def _load(root: Path, model: LibraryModel) -> CadModel:
+    mesh = read_mesh(root, model.catid, model.model_id)
+    group, colors = read_face_colors(mesh_path(root, model.catid, model.model_id), len(mesh.faces))
+    return CadModel(
+        catid=model.catid,
+        model_id=model.model_id,
+        category=model.category,
+        kind=model.kind,
+        vertices=np.asarray(mesh.vertices),
+        faces=np.asarray(mesh.faces),
+        face_color=colors[group],
+        face_group=group,
+        symmetry=model.symmetry,
+        size_m=np.array(model.size_m),
+        support=KINDS[model.kind].support,
+        source=root,
+    )

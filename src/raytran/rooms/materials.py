@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Procedural grey textures with mip levels, and the palettes that colour them."""
+
+from __future__ import annotations
+
+import colorsys
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from raytran.rooms.surfaces import Paint
+
+SIZE = 512
+"""Texels along each side of a texture at its finest level."""
+
+LEVELS = 10
+"""Mip levels of a texture, from ``SIZE`` texels down to one."""
+
+TEXTURES = {
+    "plain": 1.0,
+    "plaster": 1.6,
+    "stripes": 0.8,
+    "planks": 2.4,
+    "parquet": 1.6,
+    "tiles": 1.2,
+    "carpet": 0.8,
+    "wood": 1.2,
+    "fabric": 0.4,
+    "sky": 3.0,
+    "picture": 1.3,
+}
+"""Name and side length in metres of every texture; a texture repeats after that length."""
+
+_NAMES = tuple(TEXTURES)
+_SEED = 20220721
+
+
+def texture_index(name: str) -> int:
+    """Return the number of the texture called ``name``."""
+    return _NAMES.index(name)
+
+
+@dataclass(frozen=True)
+class TextureLibrary:
+    """All textures and their mip levels in one array.
+
+    Attributes:
+        texels: all levels of all textures, float32 in [0, 1].
+        side: ``(n,)`` metres.
+    """
+
+    texels: NDArray[np.float32]
+    side: NDArray[np.float32]
+
+    def sample(
+        self,
+        texture: NDArray[np.int32],
+        u: NDArray[np.float32],
+        v: NDArray[np.float32],
+        footprint: NDArray[np.float32],
+    ) -> NDArray[np.float32]:
+        """Return the grey value at surface coordinates.
+
+        Args:
+            texture: ``(n,)`` texture of each sample.
+            u: ``(n,)`` metres along the surface.
+            v: ``(n,)`` metres along the surface.
+            footprint: ``(n,)`` size of a pixel on the surface, metres; chooses the mip level.
+
+        Returns:
+            ``(n,)`` in [0, 1].
+        """
+        density = (SIZE / self.side)[texture]
+        # The exponent of the footprint in texels is the level whose texels are as large as the pixel.
+        level = np.frexp(footprint * density)[1].clip(0, LEVELS - 1)
+        column = np.floor(u * density).astype(np.int32) & (SIZE - 1)
+        row = np.floor(v * density).astype(np.int32) & (SIZE - 1)
+        start = texture * _LEVEL_START[-1] + _LEVEL_START[level]
+        return self.texels[start + ((row >> level) << (LEVELS - 1 - level)) + (column >> level)]
+
+
+_LEVEL_START = np.concatenate([[0], np.cumsum([(SIZE >> level) ** 2 for level in range(LEVELS)])]).astype(
+    np.int32
+)
+
+
+@lru_cache(maxsize=3)
+def texture_library(draw: int = 0) -> TextureLibrary:
+    """Return one of any number of draws of all textures, the same in every process."""
+    rng = np.random.default_rng([_SEED, draw] if draw else _SEED)
+    texels: list[NDArray[np.float32]] = []
+    for name in _NAMES:
+        image = _draw(name, rng).clip(0.0, 1.0).astype(np.float32)
+        for _ in range(LEVELS):
+            texels.append(image.ravel())
+            half = image.shape[0] // 2
+            image = image.reshape(half, 2, half, 2).mean(axis=(1, 3)) if half else image
+    return TextureLibrary(np.concatenate(texels), np.array(list(TEXTURES.values()), dtype=np.float32))
+
+
+def value_noise(rng: np.random.Generator, cells: tuple[int, int]) -> NDArray[np.float64]:
+    """Return ``(SIZE, SIZE)`` periodic noise: random values on a lattice, smoothly interpolated."""
+    lattice = rng.random(cells)
+    result = lattice
+    for axis, count in enumerate(cells):
+        position = np.arange(SIZE) * count / SIZE
+        index = np.floor(position).astype(int)
+        weight = position - index
+        weight = weight * weight * (3 - 2 * weight)
+        weight = weight[:, None] if axis == 0 else weight[None, :]
+        low, high = np.take(result, index, axis=axis), np.take(result, (index + 1) % count, axis=axis)
+        result = low + (high - low) * weight
+    return result
+
+
+def _cloud(rng: np.random.Generator, cells: int, octaves: int) -> NDArray[np.float64]:
+    parts = [value_noise(rng, (cells << i, cells << i)) * 0.5**i for i in range(octaves)]
+    return sum(parts, np.zeros(())) / (2 - 0.5 ** (octaves - 1))
+
+
+def _grain(rng: np.random.Generator) -> NDArray[np.float64]:
+    """Wood grain: noise stretched along u, bent by a slow cloud."""
+    bent = _cloud(rng, 3, 2) * 10 + value_noise(rng, (64, 2)) * 1.5
+    return (
+        0.5
+        + 0.3 * np.sin(2 * np.pi * bent) * value_noise(rng, (16, 4))
+        + 0.35 * (value_noise(rng, (256, 8)) - 0.5)
+    )
+
+
+def _blocks(
+    rng: np.random.Generator, rows: int, columns: int, shift: float, gap: float
+) -> NDArray[np.float64]:
+    """Staggered blocks of differing grey with dark joints of ``gap`` (share of a row's height)."""
+    v, u = np.meshgrid(np.arange(SIZE) * rows / SIZE, np.arange(SIZE) * columns / SIZE, indexing="ij")
+    row = v.astype(int)
+    u = u + row * shift
+    shade = rng.random((rows, columns))[row, u.astype(int) % columns]
+    joint = (v % 1 < gap) | (u % 1 < gap * columns / rows)
+    return np.where(joint, 0.0, 0.35 + 0.65 * shade)
+
+
+def _draw(name: str, rng: np.random.Generator) -> NDArray[np.float64]:
+    if name == "plaster":
+        return 0.7 * _cloud(rng, 8, 4) + 0.3 * rng.random((SIZE, SIZE))
+    if name == "stripes":
+        wave = (np.arange(SIZE) * 8 // SIZE) % 2
+        return 0.15 + 0.7 * np.tile(wave, (SIZE, 1)) + 0.15 * _cloud(rng, 16, 2)
+    if name == "planks":
+        return 0.6 * _blocks(rng, 16, 2, 0.5, 0.04) + 0.5 * _grain(rng) - 0.1
+    if name == "parquet":
+        return 0.6 * _blocks(rng, 16, 4, 0.5, 0.05) + 0.4 * _grain(rng)
+    if name == "tiles":
+        return 0.75 * _blocks(rng, 4, 4, 0.0, 0.03) ** 0.4 + 0.25 * _cloud(rng, 8, 4)
+    if name == "carpet":
+        return 0.5 * rng.random((SIZE, SIZE)) + 0.5 * _cloud(rng, 16, 4)
+    if name == "wood":
+        return _grain(rng)
+    if name == "fabric":
+        weave = np.sin(np.arange(SIZE) * 2 * np.pi * 64 / SIZE)
+        return 0.5 + 0.2 * weave[:, None] * weave[None, :] + 0.4 * (_cloud(rng, 16, 3) - 0.5)
+    if name == "sky":
+        return 0.6 + 0.8 * (_cloud(rng, 3, 4) - 0.5)
+    if name == "picture":
+        return np.floor(_cloud(rng, 4, 3) * 6) / 5
+    return np.ones((SIZE, SIZE))
+
+
+def tinted(hue: float, saturation: float, value: float, contrast: float, texture: str) -> Paint:
+    """Return a paint around one colour.
+
+    Args:
+        hue: in [0, 1].
+        saturation: in [0, 1].
+        value: brightness in [0, 1] where the texture is 1.
+        contrast: share of the brightness that is lost where the texture is 0.
+        texture: name in ``TEXTURES``.
+    """
+    light = colorsys.hsv_to_rgb(hue % 1.0, saturation, value)
+    dark = colorsys.hsv_to_rgb(hue % 1.0, min(1.0, saturation * 1.15), value * (1 - contrast))
+    return Paint(dark=dark, light=light, texture=texture_index(texture))
+
+
+def wall_paint(rng: np.random.Generator) -> Paint:
+    """Draw a wall: painted plaster or striped wallpaper, bright and little saturated."""
+    texture = "stripes" if rng.random() < 0.2 else "plaster"
+    contrast = rng.uniform(0.06, 0.2) if texture == "stripes" else rng.uniform(0.03, 0.12)
+    saturation = rng.uniform(0.1, 0.35) if rng.random() < 0.35 else rng.uniform(0.0, 0.08)
+    return tinted(rng.random(), saturation, rng.uniform(0.75, 0.96), contrast, texture)
+
+
+def floor_paint(rng: np.random.Generator, *, wet: bool) -> Paint:
+    """Draw a floor: wood, tiles or carpet; always tiles in a wet room."""
+    texture = (
+        "tiles" if wet else str(rng.choice(["planks", "parquet", "carpet", "tiles"], p=[0.4, 0.2, 0.3, 0.1]))
+    )
+    if texture in ("planks", "parquet"):
+        return tinted(rng.uniform(0.05, 0.1), rng.uniform(0.3, 0.6), rng.uniform(0.4, 0.8), 0.45, texture)
+    contrast = 0.35 if texture == "tiles" else 0.3
+    colorful = texture == "carpet" and rng.random() < 0.4
+    saturation = rng.uniform(0.1, 0.35) if colorful else rng.uniform(0.0, 0.1)
+    return tinted(rng.random(), saturation, rng.uniform(0.35, 0.85), contrast, texture)

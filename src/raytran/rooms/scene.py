@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A whole scene before it is written: furnished room, camera walk, and how both lie in the scan's frame."""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from raytran.errors import ConfigError
+from raytran.rooms.cameras import make_intrinsics, plan_path
+from raytran.rooms.collision import Boxes
+from raytran.rooms.furnish import ROOM_KINDS, Furnisher
+from raytran.rooms.layout import Layout
+from raytran.rooms.materials import texture_index, texture_library
+from raytran.rooms.placed import FLOOR, PlacedObject
+from raytran.rooms.pool import ModelPool
+from raytran.rooms.render import Pinhole, Renderer
+from raytran.rooms.room import Room, make_room
+from raytran.rooms.surfaces import Paint, Surfaces
+
+_ATTEMPTS = 40
+
+
+@dataclass(frozen=True)
+class RoomSettings:
+    """What every room of a data set has in common.
+
+    Attributes:
+        seed: with the scene's number it determines everything about the scene.
+        frames: pictures with a valid pose.
+        image_size: ``(H, W)`` pixels.
+        min_objects: least number of objects.
+        max_objects: greatest number of objects.
+        room_size: ranges of the longer and of the shorter side of the floor, metres.
+    """
+
+    seed: int
+    frames: int
+    image_size: tuple[int, int]
+    min_objects: int
+    max_objects: int
+    room_size: tuple[tuple[float, float], tuple[float, float]]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A furnished room with a camera walk.
+
+    Attributes:
+        room: the empty room.
+        objects: its objects, parents before what stands on them.
+        cameras: the walk, in the room's frame.
+        renderer: draws the room.
+        scan_from_room: ``(4, 4)``: rooms do not lie along the axes of their scan.
+    """
+
+    room: Room
+    objects: tuple[PlacedObject, ...]
+    cameras: tuple[Pinhole, ...]
+    renderer: Renderer
+    scan_from_room: NDArray[np.float64]
+
+
+def make_scene(
+    settings: RoomSettings, rng: np.random.Generator, pool: ModelPool | None = None, *, textures: int = 0
+) -> Scene:
+    """Draw a scene in which every object is seen in several frames.
+
+    Args:
+        settings: what all rooms have in common.
+        rng: source of all choices.
+        pool: where the furniture comes from; None for generated models.
+        textures: which draw of the textures is used.
+
+    Raises:
+        ConfigError: no such scene was found, as when many objects are asked of a tiny room.
+    """
+    pool = pool or ModelPool(settings.seed)
+    for _ in range(_ATTEMPTS):
+        layout = _furnished(settings, pool, rng)
+        if len(layout.objects) < settings.min_objects:
+            continue
+        scene = _filmed(settings, layout, rng, textures)
+        if scene is not None:
+            return scene
+    (a, b), (c, d) = settings.room_size
+    raise ConfigError(
+        f"no room of {a}-{b} m by {c}-{d} m was found that shows the camera {settings.min_objects} to "
+        f"{settings.max_objects} objects; ask for fewer objects or larger rooms"
+    )
+
+
+def _furnished(settings: RoomSettings, pool: ModelPool, rng: np.random.Generator) -> Layout:
+    kind = str(rng.choice(list(ROOM_KINDS), p=list(ROOM_KINDS.values())))
+    x, y = (rng.uniform(low, high) for low, high in settings.room_size)
+    if kind == "bathroom":
+        x, y = (low + 0.35 * (side - low) for side, (low, _) in zip((x, y), settings.room_size, strict=True))
+    size = (x, y, rng.uniform(2.4, 3.0))
+    # Few rooms are crowded: the number of objects follows the area, with a long tail.
+    usual = settings.min_objects + (0.35 + rng.gamma(2.0, 0.3)) * (x * y - 4)
+    wanted = int(np.clip(usual * rng.uniform(0.5, 1.0), settings.min_objects, settings.max_objects))
+    layout = Layout(room=make_room(kind, size, rng), rng=rng)
+    Furnisher(layout=layout, pool=pool, wanted=wanted).furnish()
+    return layout
+
+
+def _filmed(settings: RoomSettings, layout: Layout, rng: np.random.Generator, textures: int) -> Scene | None:
+    """Walk through the room and take out what is not seen often enough; None if too little remains."""
+    paints = [_paint_object(placed, rng) for placed in layout.objects]
+    renderer = _make_renderer(layout.room, layout.objects, paints, textures)
+    cameras, missed = plan_path(
+        room=layout.room,
+        boxes=Boxes.joined([placed.box for placed in layout.objects]),
+        renderer=renderer,
+        intrinsics=make_intrinsics(settings.image_size, rng),
+        image_size=settings.image_size,
+        frames=settings.frames,
+        rng=rng,
+    )
+    if missed.any():
+        kept = _without(layout.objects, missed)
+        if len(kept) < settings.min_objects:
+            return None
+        objects = tuple(
+            replace(layout.objects[i], parent=_new_number(kept, layout.objects[i].parent)) for i in kept
+        )
+        renderer = _make_renderer(layout.room, objects, [paints[i] for i in kept], textures)
+    else:
+        objects = tuple(layout.objects)
+    renderer.expose(cameras[:: max(1, len(cameras) // 6)], brightness=rng.uniform(0.35, 0.55))
+    return Scene(layout.room, objects, tuple(cameras), renderer, _draw_scan_frame(layout.room, rng))
+
+
+def _without(objects: list[PlacedObject], missed: NDArray[np.bool_]) -> list[int]:
+    """Return the numbers of the objects that stay: seen, and standing on nothing that goes."""
+    kept: list[int] = []
+    for number, placed in enumerate(objects):
+        if not missed[number] and (placed.parent == FLOOR or placed.parent in kept):
+            kept.append(number)
+    return kept
+
+
+def _new_number(kept: list[int], parent: int) -> int:
+    return FLOOR if parent == FLOOR else kept.index(parent)
+
+
+def _draw_scan_frame(room: Room, rng: np.random.Generator) -> NDArray[np.float64]:
+    """Draw the pose ``(4, 4)`` of the room in its scan: turned by 3 to 45 degrees and shifted."""
+    yaw = np.deg2rad(rng.uniform(3.0, 45.0)) * rng.choice([-1.0, 1.0])
+    sin, cos = np.sin(yaw), np.cos(yaw)
+    pose = np.eye(4)
+    pose[:2, :2] = [[cos, -sin], [sin, cos]]
+    middle = pose[:2, :2] @ (np.array(room.size[:2]) / 2)
+    pose[:2, 3] = rng.uniform(1.0, 4.0, size=2) - middle
+    pose[2, 3] = rng.uniform(-0.06, 0.06)
+    return pose
+
+
+def _make_renderer(
+    room: Room, objects: Sequence[PlacedObject], paints: list[list[Paint]], textures: int
+) -> Renderer:
+    parts = [room.surfaces]
+    for number, (placed, paint) in enumerate(zip(objects, paints, strict=True)):
+        triangles, group = placed.triangles(), placed.model.face_group
+        parts += [Surfaces.painted(triangles[group == i], paint[i], owner=number) for i in range(len(paint))]
+    return Renderer(surfaces=Surfaces.joined(parts), lights=room.lights, textures=texture_library(textures))
+
+
+def _paint_object(placed: PlacedObject, rng: np.random.Generator) -> list[Paint]:
+    """Draw a paint for each material of an object: wood is grained, upholstery woven, a screen may be on."""
+    model = placed.model
+    paints = []
+    soft = model.category == "sofa" or model.kind in ("armchair", "bed", "pillow")
+    screen_on = model.category == "display" and rng.random() < 0.4
+    for group in range(int(model.face_group.max()) + 1):
+        faces = model.face_group == group
+        color = model.face_color[faces][0] if faces.any() else np.ones(3)
+        hue, saturation, value = colorsys.rgb_to_hsv(*color)
+        if screen_on and value < 0.06:
+            glow = colorsys.hsv_to_rgb(rng.random(), 0.5, 0.9)
+            paints.append(Paint((0.08, 0.1, 0.15), glow, texture_index("picture"), emissive=True))
+        elif saturation > 0.25 and 0.02 < hue < 0.14 and not soft:
+            paints.append(_varied(color, "wood", 0.4))
+        elif soft or model.category == "chair":
+            paints.append(_varied(color, "fabric", 0.35))
+        else:
+            paints.append(_varied(color, "plaster", 0.06))
+    return paints
+
+
+def _varied(color: NDArray[np.float64], texture: str, contrast: float) -> Paint:
+    light = np.minimum(np.asarray(color) * (1 + contrast / 3), 1.0)
+    red, green, blue = light
+    dark_red, dark_green, dark_blue = light * (1 - contrast)
+    return Paint(
+        (float(dark_red), float(dark_green), float(dark_blue)),
+        (float(red), float(green), float(blue)),
+        texture_index(texture),
+    )

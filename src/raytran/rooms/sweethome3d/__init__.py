@@ -1,0 +1,6 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Freely licensed furniture turned into CAD models in the layout of ShapeNetCore v2."""
+
+from raytran.rooms.sweethome3d.furniture import FurnitureReport, import_furniture
+
+__all__ = ["FurnitureReport", "import_furniture"]

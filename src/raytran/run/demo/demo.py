@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole path on a few generated rooms: make, train, measure, predict, show."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
+
+from raytran.checkpoints.checkpoint import load_model, prediction_settings
+from raytran.checkpoints.network import own_packages
+from raytran.checkpoints.weights import shipped_weights
+from raytran.data.atomic import write_json
+from raytran.errors import ConfigError
+from raytran.model import RayTran
+from raytran.run.demo.page import COLUMNS, ShownScene, headline, write_page
+from raytran.run.demo.steps import StepTimes
+from raytran.run.entry import compose
+from raytran.run.evaluate.evaluate import TASKS_WITH_SHAPE, about_data, evaluate_model
+from raytran.run.predict.files import write_scene
+from raytran.run.predict.predict import predict_scene
+from raytran.run.train.build import build_data, plain
+from raytran.run.train.curriculum import run_curriculum
+from raytran.run.train.fit import FitResult
+from raytran.training.datamodule import SceneDataModule
+
+_log = logging.getLogger(__name__)
+
+_RECORD = "demo.json"
+_RECORDED = ("preset", "seed", "model", "loss", "optimizer", "views", "rooms", "schedule")
+"""Settings that a demo must share with the one it continues."""
+
+_SETTINGS = (
+    "experiment=stage2",
+    "data.val_views=${views.predict_views}",
+    "stage.targets=[occupancy,foreground,objects,shapes]",
+)
+"""All targets that are measured, and the views that a prediction takes."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """A network, and the rooms it is asked about.
+
+    Attributes:
+        model: the network.
+        checkpoint: its file.
+        data: rooms, with the images and the grid that the network wants.
+        split: which of them.
+        num_views: frames of each.
+    """
+
+    model: RayTran
+    checkpoint: Path
+    data: SceneDataModule
+    split: str
+    num_views: int
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What a demo leaves.
+
+    Attributes:
+        page: the HTML file.
+        metrics: content of ``metrics.json`` of each of ``COLUMNS`` (``shipped`` only if raytran has weights).
+        seconds: time of each step.
+    """
+
+    page: Path
+    metrics: Mapping[str, Mapping[str, Any]]
+    seconds: Mapping[str, float]
+
+
+def demo(cfg: DictConfig) -> DemoResult:
+    """Run ``python -m raytran.demo``; see ``conf/demo.yaml``.
+
+    Rooms and stages that an earlier run in the same folder finished are kept, an interrupted stage goes on;
+    what follows from them takes seconds and is made anew.
+
+    Raises:
+        ConfigError: the folder holds a demo with other settings.
+    """
+    output = Path(cfg.output).resolve()
+    overrides = [f"preset={cfg.preset}", f"data.root={_quoted(output / 'rooms')}", *plain(cfg.overrides)]
+    data = _data(overrides, output)
+    times = StepTimes(output / "times.json")
+    with times.measure("rooms", continues=True):
+        data.prepare_data()
+    fits = _train(overrides, output / "training", times)
+    asked = _asked(overrides, data, fits[-1].checkpoint)
+    with times.measure("evaluation"):
+        metrics = {name: _evaluate(cfg, part, output / "evaluation" / name) for name, part in asked.items()}
+    with times.measure("prediction"):
+        scenes = [_predict_first(cfg, name, part, output) for name, part in asked.items()]
+    with times.measure("page"):
+        page = write_page(output, scenes=scenes, metrics=metrics, fits=fits, seconds=times.seconds)
+    _tell(page, metrics, times.seconds)
+    return DemoResult(page, metrics, times.seconds)
+
+
+def _data(overrides: Sequence[str], output: Path) -> SceneDataModule:
+    """Return the rooms, with all targets that are measured and the views that a prediction takes.
+
+    Raises:
+        ConfigError: ``output`` holds a demo with other settings.
+    """
+    cfg = compose("train", [*overrides, *_SETTINGS, f"output_dir={_quoted(output)}"])
+    wanted = {
+        name: value if isinstance(value := cfg[name], str | int) else plain(value) for name in _RECORDED
+    }
+    path = output / _RECORD
+    if path.is_file() and json.loads(path.read_text()) != wanted:
+        raise ConfigError(
+            f"{output} holds a demo with other settings: delete it or give output=ANOTHER_FOLDER"
+        )
+    output.mkdir(parents=True, exist_ok=True)
+    write_json(path, wanted)
+    return build_data(cfg)
+
+
+def _train(overrides: Sequence[str], folder: Path, times: StepTimes) -> list[FitResult]:
+    fits = run_curriculum(overrides, output_dir=folder)
+    for fit in fits:
+        # A stage that had finished before took no time now; its entry is there already.
+        if fit.seconds:
+            times.add(f"training, {fit.folder.name}", fit.seconds)
+    return fits
+
+
+def _asked(overrides: Sequence[str], data: SceneDataModule, checkpoint: Path) -> dict[str, Asked]:
+    """Return who is asked about what, by ``COLUMNS``: the package's weights too, if it has any."""
+    # The network was composed from what is typed here, not out of a file: its own classes are trusted.
+    cfg = compose("train", [*overrides, *_SETTINGS, "output_dir=unused"])
+    model = load_model(checkpoint, trust=own_packages(plain(cfg.model)))
+    views = int(cfg.views.predict_views)
+    asked = {split: Asked(model, checkpoint, data, split, views) for split in ("train", "val")}
+    shipped = shipped_weights()
+    if shipped is not None:
+        model, wanted = load_model(shipped), prediction_settings(shipped)
+        # The same rooms, as this network wants to see them.
+        fit = {
+            "views.image_size": wanted.image_size,
+            "model.grid_resolution": model.grid_resolution,
+            "model.grid_extent": model.grid_extent,
+        }
+        settings = [f"{name}={list(value)}" for name, value in fit.items()]
+        cfg = compose("train", [*overrides, *_SETTINGS, *settings])
+        asked["shipped"] = Asked(model, shipped, build_data(cfg), "val", views)
+    return asked
+
+
+def _evaluate(cfg: DictConfig, asked: Asked, output: Path) -> dict[str, Any]:
+    about = {"checkpoint": str(asked.checkpoint), **about_data(asked.data, asked.split, asked.num_views)}
+    return evaluate_model(
+        asked.model,
+        asked.data.split(asked.split),
+        tasks=TASKS_WITH_SHAPE,
+        output=output,
+        score_threshold=cfg.score_threshold,
+        duplicate_iou=cfg.duplicate_iou,
+        about=about,
+    )
+
+
+def _predict_first(cfg: DictConfig, name: str, asked: Asked, output: Path) -> ShownScene:
+    """Predict the first of the rooms; write what ``raytran.predict`` writes, the truth in the plan."""
+    batch = asked.data.split(asked.split)[0]
+    found = predict_scene(
+        asked.model,
+        batch.views,
+        scene_id=batch.scene_id[0],
+        score_threshold=cfg.score_threshold,
+        duplicate_iou=cfg.duplicate_iou,
+    )
+    folder = output / "predictions" / (("shipped-" if name == "shipped" else "") + batch.scene_id[0])
+    truth = None if batch.objects is None else batch.objects[0]
+    extent = asked.model.grid_extent
+    write_scene(folder, found, batch.views, batch.frame_id[0], grid_extent=extent, truth=truth)
+    return ShownScene(name, folder, batch, found.prediction, extent)
+
+
+def _tell(page: Path, metrics: Mapping[str, Mapping[str, Any]], seconds: Mapping[str, float]) -> None:
+    table = Table(
+        "", *(COLUMNS[name] for name in metrics), title=f"demo, {sum(seconds.values()) / 60:.1f} min"
+    )
+    columns = [headline(entry) for entry in metrics.values()]
+    for name in columns[0]:
+        table.add_row(name, *(column[name] for column in columns))
+    console = Console()
+    console.print(table)
+    console.print(f"Everything is in {page.parent}")
+    console.print(f"Open {page}", soft_wrap=True)
+
+
+def _quoted(path: Path) -> str:
+    """Return a path as Hydra's override grammar wants it."""
+    escaped = str(path).replace("\\", "\\\\").replace('"', '\\"')
+    return f'"{escaped}"'

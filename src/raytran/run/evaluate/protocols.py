@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The scores of predictions from files under each protocol, with intervals and comparisons."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from raytran.data.scan2cad import SceneAnnotation, read_annotations, scene_alignments, scene_objects
+from raytran.data.scannet.scan import read_scan
+from raytran.errors import ConfigError, DataError
+from raytran.metrics.atlas import ErrorAtlas
+from raytran.metrics.bootstrap import (
+    Comparison,
+    Interval,
+    Statistic,
+    bootstrap_interval,
+    class_average,
+    class_counts,
+    compare_paired,
+    f1,
+    global_average,
+)
+from raytran.metrics.curves import AccuracyCurves, accuracy_by_scene_size
+from raytran.metrics.functional.cad_errors import cad_symmetries
+from raytran.metrics.odam import OrientedBoxF1
+from raytran.metrics.records import Row
+from raytran.metrics.scan2cad import Scan2CADAccuracy
+from raytran.run.evaluate.files import CadBoxes, PredictionFiles
+from raytran.structs import CadAlignments, ObjectSet
+
+_log = logging.getLogger(__name__)
+
+PROTOCOLS: tuple[str, ...] = ("strict", "scan2cad", "vid2cad", "odam")
+ALL_PROTOCOLS = "all"
+_NEEDS_CADS = ("scan2cad", "vid2cad")
+
+
+@dataclass(frozen=True)
+class ProtocolScores:
+    """What one protocol says of one set of predictions.
+
+    Attributes:
+        metrics: the part of ``metrics.json`` under the protocol's name.
+        objects: a row for each annotated object that counts.
+        scenes: a row for each scene that counts.
+        atlas: what ``ErrorAtlas`` returns; None for the official protocols.
+    """
+
+    metrics: dict[str, Any]
+    objects: list[Row]
+    scenes: list[Row]
+    atlas: Mapping[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The annotated scenes that are asked for, in the forms that the protocols compare."""
+
+    objects: dict[str, ObjectSet]
+    alignments: dict[str, CadAlignments]
+    cad_boxes: CadBoxes
+    volume_center: dict[str, Tensor]
+
+
+def read_truth(annotations: Path, *, split: Path | None = None, scans: Path | None = None) -> Truth:
+    """Read the annotated scenes.
+
+    Args:
+        annotations: Scan2CAD's ``full_annotations.json``.
+        split: text file of scene names, one a line; None: all scenes of the annotations.
+        scans: folder of ScanNet scans, whose cameras tell where each voxel grid was; None: unknown.
+
+    Raises:
+        DataError: a file is missing or damaged, or no scene of the split is annotated.
+    """
+    scenes = read_annotations(annotations)
+    chosen = _of_split(scenes, split, annotations)
+    centers = {} if scans is None else {name: _volume_center(scans / name) for name in chosen}
+    return Truth(
+        objects={name: scene_objects(scene) for name, scene in chosen.items()},
+        alignments={name: scene_alignments(scene) for name, scene in chosen.items()},
+        cad_boxes={
+            name: (center, half)
+            for scene in scenes.values()
+            for name, center, half in zip(scene.model_id, scene.box_center, scene.box_half_size, strict=True)
+        },
+        volume_center=centers,
+    )
+
+
+def _of_split(
+    scenes: Mapping[str, SceneAnnotation], split: Path | None, annotations: Path
+) -> dict[str, SceneAnnotation]:
+    if split is None:
+        return dict(scenes)
+    try:
+        names = split.read_text(encoding="utf-8").split()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"cannot read the scene names split={split} ({error}): check the path") from error
+    chosen = {name: scene for name, scene in scenes.items() if name in set(names)}
+    if not chosen:
+        raise DataError(f"none of the {len(names)} scenes that {split} names is annotated in {annotations}")
+    return chosen
+
+
+def _volume_center(scan: Path) -> Tensor:
+    """Return the mean camera position, on which the voxel grid of a scan is centred."""
+    return read_scan(scan).world_from_camera[:, :3, 3].mean(dim=0)
+
+
+def choose_protocols(protocol: str, files: PredictionFiles, path: Path) -> tuple[str, ...]:
+    """Return the protocols to follow.
+
+    Raises:
+        ConfigError: the protocol is unknown, or compares CAD models, which the predictions do not name.
+    """
+    if protocol not in (*PROTOCOLS, ALL_PROTOCOLS):
+        known = ", ".join((*PROTOCOLS, ALL_PROTOCOLS))
+        raise ConfigError(f"unknown protocol={protocol}, choose one of: {known}")
+    without = [scene.path for scene in files.scenes.values() if scene.cads is None]
+    possible = tuple(name for name in PROTOCOLS if not (without and name in _NEEDS_CADS))
+    if protocol == ALL_PROTOCOLS:
+        if without:
+            _log.warning("%s has objects without CAD models: only %s apply", without[0], ", ".join(possible))
+        return possible
+    if protocol not in possible:
+        raise ConfigError(
+            f"protocol={protocol} compares CAD models, and {without[0]} has objects without catid_cad and "
+            f"id_cad: choose one of {', '.join(possible)}"
+        )
+    return (protocol,)
+
+
+def score_protocol(
+    protocol: str, files: PredictionFiles, truth: Truth, *, volume_extent: Sequence[float] | None = None
+) -> ProtocolScores:
+    """Score predictions under one protocol.
+
+    Under ``strict`` and ``vid2cad`` scenes without a file count as scenes in which nothing was found; under
+    ``scan2cad`` and ``odam`` they do not count at all, as in the official scripts.
+    """
+    if protocol == "strict":
+        return _score_strict(files, truth, volume_extent)
+    if protocol == "odam":
+        names = [name for name in truth.alignments if name in files.scenes]
+        boxes = [files.scenes[name].boxes for name in names]
+        half_extents = {name: half.tolist() for name, (_, half) in truth.cad_boxes.items()}
+        metric: OrientedBoxF1 | Scan2CADAccuracy = OrientedBoxF1(
+            protocol="odam", cad_half_extents=half_extents
+        )
+    else:
+        names = [name for name in truth.alignments if name in files.scenes or protocol == "vid2cad"]
+        found = {name: scene.cads for name, scene in files.scenes.items()}
+        boxes = [found.get(name) or CadAlignments.empty() for name in names]
+        symmetries = cad_symmetries(truth.alignments[name] for name in names)
+        metric = Scan2CADAccuracy(protocol=protocol, cad_symmetries=symmetries)
+    metric.update(boxes, [truth.alignments[name] for name in names], names)
+    return ProtocolScores(dict(metric.compute()), metric.rows("object"), metric.rows("scene"))
+
+
+def _score_strict(
+    files: PredictionFiles, truth: Truth, volume_extent: Sequence[float] | None
+) -> ProtocolScores:
+    names, targets = list(truth.objects), list(truth.objects.values())
+    missing = sum(name not in files.scenes for name in names)
+    if missing:
+        _log.warning(
+            "%d of %d scenes have no predictions, and count as scenes in which nothing was found; name the "
+            "scenes that were asked for with split=FILE",
+            *(missing, len(names)),
+        )
+    found = {name: scene.objects for name, scene in files.scenes.items()}
+    predictions = [found.get(name, ObjectSet.empty()) for name in names]
+    accuracy, box_f1, curves = Scan2CADAccuracy(), OrientedBoxF1(), AccuracyCurves()
+    for metric in (accuracy, box_f1, curves):
+        metric.update(predictions, targets, names)
+    atlas = ErrorAtlas(volume_extent=volume_extent)
+    atlas.update(predictions, targets, names, [truth.volume_center.get(name) for name in names])
+    objects = accuracy.rows("object")
+    metrics: dict[str, Any] = dict(accuracy.compute()) | dict(box_f1.compute())
+    metrics |= {"by_scene_size": accuracy_by_scene_size(objects), "curves": curves.compute()}
+    metrics["atlas"] = atlas.compute()
+    return ProtocolScores(
+        metrics,
+        _side_by_side(objects, box_f1.rows("object"), atlas.rows("object")),
+        _side_by_side(accuracy.rows("scene"), box_f1.rows("scene")),
+        atlas.compute(),
+    )
+
+
+def _side_by_side(*tables: Sequence[Row]) -> list[Row]:
+    return [{key: value for row in rows for key, value in row.items()} for rows in zip(*tables, strict=True)]
+
+
+def confidence(scores: ProtocolScores, *, num_resamples: int, seed: int) -> dict[str, Interval]:
+    """Return the 95 % intervals of a protocol's main numbers over its scenes."""
+    names = [str(row["scene_id"]) for row in scores.scenes]
+    return {
+        number: bootstrap_interval(
+            _counts(number, scores, names, _classes(scores)),
+            statistic,
+            num_resamples=num_resamples,
+            seed=seed,
+        )
+        for number, statistic in _statistics(scores).items()
+    }
+
+
+def compare(
+    first: ProtocolScores, second: ProtocolScores, *, num_resamples: int, seed: int
+) -> dict[str, Comparison]:
+    """Compare two sets of predictions under one protocol, on the scenes that count for both."""
+    others = {row["scene_id"] for row in second.scenes}
+    names = [str(row["scene_id"]) for row in first.scenes if row["scene_id"] in others]
+    classes = sorted({*_classes(first), *_classes(second)})
+    return {
+        number: compare_paired(
+            _counts(number, first, names, classes),
+            _counts(number, second, names, classes),
+            statistic,
+            num_resamples=num_resamples,
+            seed=seed,
+        )
+        for number, statistic in _statistics(first).items()
+    }
+
+
+def _statistics(scores: ProtocolScores) -> dict[str, Statistic]:
+    """Return the main numbers of a protocol and how each follows from sums over scenes."""
+    found: dict[str, Statistic] = {}
+    if "per_class" in scores.metrics:
+        found |= {"class_average": class_average, "global_average": global_average}
+    return found | {f"f1_{threshold}": f1 for threshold in scores.metrics.get("per_threshold", {})}
+
+
+def _classes(scores: ProtocolScores) -> list[str]:
+    """Return the classes that count; those of a protocol may be fewer than those of its rows."""
+    return [name for name, entry in scores.metrics.get("per_class", {}).items() if entry["n_total"]]
+
+
+def _counts(number: str, scores: ProtocolScores, names: Sequence[str], classes: Sequence[str]) -> Tensor:
+    """Return what each scene adds to the sums behind a number, ``(S, C)``."""
+    if not number.startswith("f1_"):
+        return class_counts([row for row in scores.objects if row["category"] in classes], names, classes)
+    by_name = {row["scene_id"]: row for row in scores.scenes}
+    columns = (number.replace("f1", "n_matched"), "n_predicted", "n_true")
+    rows = [[float(by_name[name][column] or 0) for column in columns] for name in names]
+    return torch.tensor(rows, dtype=torch.float64).reshape(len(names), len(columns))

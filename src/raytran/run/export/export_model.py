@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write a network to a file that others can use: ``python -m raytran.export_model``."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+from rich.console import Console
+from rich.table import Table
+
+from raytran.checkpoints.checkpoint import model_from, prediction_settings
+from raytran.checkpoints.file import read_checkpoint
+from raytran.checkpoints.known_data import KnownData
+from raytran.checkpoints.network import trusted_packages
+from raytran.checkpoints.weights import checkpoint_path, export_weights
+from raytran.checkpoints.weights_file import PREFIX, SUFFIX
+from raytran.errors import ConfigError
+from raytran.run.export.program import SUFFIX as PROGRAM_SUFFIX
+from raytran.run.export.program import export_program
+from raytran.run.train.build import plain
+from raytran.structs import CLASSES
+
+_log = logging.getLogger(__name__)
+
+
+def export_model(cfg: DictConfig) -> Path | None:
+    """Run ``python -m raytran.export_model``; see ``conf/export_model.yaml``.
+
+    Returns:
+        The file that was written, None if there was only to say what is in the checkpoint.
+
+    Raises:
+        ConfigError: a setting is unknown, or ``output`` is the checkpoint itself or a folder.
+        CheckpointError: the checkpoint is missing or damaged, or the file cannot be written.
+    """
+    source = checkpoint_path(cfg.checkpoint)
+    if cfg.output is None:
+        Console().print(described(read_checkpoint(source), source))
+        return None
+    output = Path(cfg.output)
+    _check_output(source, output)
+    checkpoint = read_checkpoint(source)
+    # What cannot be loaded is not given away.
+    model = model_from(checkpoint, source, trust=trusted_packages(cfg.trust))
+    if output.suffix == SUFFIX:
+        export_weights(checkpoint, source, output, dtype=cfg.dtype)
+    else:
+        if cfg.dtype != "float32":
+            raise ConfigError(f"dtype={cfg.dtype} is for {SUFFIX}: a program computes in float32")
+        size = prediction_settings(source).image_size
+        export_program(model, checkpoint, output, image_size=size, **plain(cfg.program))
+    _log.info("wrote %s: %.1f MB", output.resolve(), output.stat().st_size / 1e6)
+    return output
+
+
+def described(checkpoint: Mapping[str, Any], path: Path) -> Table:
+    """Return what a checkpoint says of itself, for the terminal."""
+    weights = [value for name, value in checkpoint["state_dict"].items() if name.startswith(PREFIX)]
+    dtypes = sorted(
+        {str(value.dtype).removeprefix("torch.") for value in weights if value.is_floating_point()}
+    )
+    views, versions = checkpoint["views"], checkpoint.get("versions") or {}
+    parent = checkpoint.get("parent") or {}
+    rows = {
+        "size": f"{path.stat().st_size / 1e6:.1f} MB",
+        "preset": checkpoint["preset"],
+        "stage": checkpoint["stage"],
+        "steps": checkpoint.get("global_step"),
+        "parent": f"stage {parent['stage']}, {parent['step']} steps" if parent else None,
+        "trained on": str(known) if (known := KnownData.of_checkpoint(checkpoint)) else None,
+        "weights": f"{sum(value.numel() for value in weights) / 1e6:.2f} M, {', '.join(dtypes)}",
+        "images": f"{views.get('image_size')}, {views.get('predict_views')} a scene",
+        "raytran": versions.get("raytran"),
+        "commit": checkpoint.get("git_commit"),
+        "torch": versions.get("torch"),
+        "WARNING": "; ".join(checkpoint.get("warnings") or ()) or None,
+        **{name: score for name, score in (checkpoint.get("scores") or {}).items() if _is_summary(name)},
+    }
+    table = Table("", "", title=str(path), show_header=False)
+    table.columns[1].overflow = "fold"
+    for name, value in rows.items():
+        if value is not None:
+            table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
+    return table
+
+
+def _is_summary(name: str) -> bool:
+    """Say whether a score is neither of one class nor of what precedes the last layer."""
+    last = name.rpartition("/")[2]
+    return last not in CLASSES and last != "proposals" and not last.startswith("layer")
+
+
+def _check_output(source: Path, output: Path) -> None:
+    if output.suffix not in (SUFFIX, PROGRAM_SUFFIX):
+        raise ConfigError(f"output={output} has an unknown ending: choose {SUFFIX} or {PROGRAM_SUFFIX}")
+    if output.is_dir():
+        raise ConfigError(f"output={output} is a folder: name a file")
+    if output.exists() and source.exists() and output.samefile(source):
+        raise ConfigError(f"output={output} is the checkpoint itself: choose another name")

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a prediction of one scene leaves behind: every file a user looks at, in one folder."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import trimesh
+
+from raytran.errors import ConfigError
+from raytran.export import write_prediction
+from raytran.export.glb import write_glb
+from raytran.export.nearest_cad import NearestCads, nearest_cads
+from raytran.export.scan2cad_csv import ALIGNMENTS, write_alignments_csv
+from raytran.geometry.camera import Cameras
+from raytran.pictures.overlay import draw_overlays
+from raytran.pictures.topdown import draw_topdown
+from raytran.pictures.turntable import draw_turntable
+from raytran.run.output import replaced_folder
+from raytran.structs import ObjectSet, ScenePrediction, Views
+from raytran.viewer.view_data import ViewedVolume, write_view_data
+
+MARKER = "scene.json"
+"""The file that tells a finished result."""
+
+
+@dataclass(frozen=True)
+class PredictedScene:
+    """A prediction whose best objects were chosen, and what was made of it.
+
+    Attributes:
+        prediction: its ``M`` objects.
+        meshes: of each object, in the world; None: empty shape.
+        cads: the CAD model of each object; None: not asked for.
+        volumes: the voxels for the viewer; None: nothing is written for it.
+    """
+
+    prediction: ScenePrediction
+    meshes: Sequence[trimesh.Trimesh | None]
+    cads: NearestCads | None = None
+    volumes: Sequence[ViewedVolume] | None = None
+
+    def with_cads(self, root: Path) -> PredictedScene:
+        """Return the scene with the CAD models of a library that its objects are most like.
+
+        Raises:
+            DataError: ``root`` holds no CAD model.
+        """
+        cads = nearest_cads(self.prediction.objects, root)
+        return replace(self, prediction=replace(self.prediction, objects=cads.objects), cads=cads)
+
+
+def check_pictures(**counts: object) -> None:
+    """Raise unless each of the settings is a number of pictures.
+
+    Raises:
+        ConfigError: one is not; it is named.
+    """
+    for name, count in counts.items():
+        if isinstance(count, bool) or not isinstance(count, int) or count < 0:
+            raise ConfigError(f"{name}={count} is no number of pictures: give 0 or more")
+
+
+def write_scene(
+    output: Path,
+    found: PredictedScene,
+    views: Views,
+    frame_ids: Sequence[str],
+    *,
+    grid_extent: tuple[float, float, float],
+    num_overlays: int = 4,
+    turntable: int = 24,
+    truth: ObjectSet | None = None,
+) -> None:
+    """Write what ``docs/outputs.md`` lists, all or nothing.
+
+    Args:
+        output: folder; replaced if it is an earlier result.
+        found: what was predicted.
+        views: B = 1, what it was predicted from.
+        frame_ids: name of each frame.
+        grid_extent: sizes of the voxel grid, metres.
+        num_overlays: frames to draw over.
+        turntable: pictures of the turn in ``turntable.gif``; 0: there is none.
+        truth: annotated objects to draw in the plan and to compare with, or None.
+
+    Raises:
+        ConfigError: ``output`` holds something that is no earlier result.
+    """
+    prediction = found.prediction
+    cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], views.image_size)
+    with replaced_folder(output, marker=MARKER) as folder:
+        draw_topdown(
+            folder / "topdown.png", prediction, truth=truth, cameras=cameras, grid_extent=grid_extent
+        )
+        if turntable:
+            draw_turntable(
+                folder / "turntable.gif",
+                prediction.objects,
+                found.meshes,
+                cameras=cameras,
+                num_frames=turntable,
+            )
+        draw_overlays(folder / "overlays", views, frame_ids, prediction, found.meshes, count=num_overlays)
+        if found.cads is not None:
+            write_alignments_csv(folder / ALIGNMENTS, found.cads.alignments())
+            write_glb(folder / "cads.glb", prediction.objects, found.cads.meshes())
+        if found.volumes is not None:
+            write_view_data(folder, prediction, views, frame_ids, volumes=found.volumes, truth=truth)
+        write_prediction(
+            folder, prediction, found.meshes, cameras=cameras, frame_ids=frame_ids, grid_extent=grid_extent
+        )

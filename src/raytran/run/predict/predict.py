@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Predict one scene from a folder of posed frames, and write everything a user looks at."""
+
+from __future__ import annotations
+
+import logging
+import shlex
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Unpack
+
+from omegaconf import DictConfig
+
+from raytran.backbone.observed import observe_attention
+from raytran.capture.open import open_scene
+from raytran.capture.orient import WorldSettings
+from raytran.checkpoints.checkpoint import PredictionSettings, load_model, prediction_settings
+from raytran.checkpoints.network import trusted_packages
+from raytran.data.shapenet.models import shapenet_version
+from raytran.errors import ConfigError
+from raytran.model import RayTran
+from raytran.postprocess import object_meshes
+from raytran.run.device import choose_device, set_matmul_precision
+from raytran.run.output import check_replaceable
+from raytran.run.predict.files import MARKER, PredictedScene, check_pictures, write_scene
+from raytran.run.predict.render import cameras_to_render, render_views
+from raytran.run.predict.room import Limits, RoomViews, check_choice, predict_room, predict_volume, read_room
+from raytran.structs import Views
+from raytran.viewer.viewed import read_truth, viewed_volumes
+
+_LOG = logging.getLogger(__name__)
+
+_UNTRAINED = {
+    "occupancy": "its objects mean nothing yet; predict with a checkpoint of stage shape",
+    "joint": "it has learned no shapes yet, so there are boxes but no meshes: those need stage shape",
+    "view": "it renders new views; its objects mean nothing unless stage.trainable left the backbone alone",
+}
+"""Stage of the curriculum that is not the last → what to expect of its checkpoints."""
+
+_WITHOUT_SHAPES = ("occupancy", "joint")
+"""Stages before that of the shapes. The surface of their noise has a quarter of a million triangles."""
+
+RGB = 3
+"""Channels of the images that a scene without annotation has."""
+
+
+def predict(cfg: DictConfig) -> Path:
+    """Run ``python -m raytran.predict``; see ``conf/predict.yaml``.
+
+    Returns:
+        The folder of results.
+
+    Raises:
+        ConfigError: a setting is unknown or ``output`` must not be replaced.
+        CheckpointError: the checkpoint is missing or damaged.
+        DataError: the scene's folder is missing or damaged.
+    """
+    scene, output = Path(cfg.scene).resolve(), Path(cfg.output)
+    world = WorldSettings(up=cfg.up, scale=cfg.scale, convention=cfg.convention, check=cfg.check)
+    check_choice(cfg.frames, cfg.num_views)
+    check_pictures(num_overlays=cfg.num_overlays, turntable=cfg.turntable)
+    check_replaceable(output.resolve(), marker=MARKER)
+    if cfg.cads:
+        shapenet_version(Path(cfg.cads))  # It raises where there are none, before the network runs.
+    settings = prediction_settings(cfg.checkpoint)
+    if settings.stage in _UNTRAINED:
+        _LOG.warning("%s is of stage %s: %s", cfg.checkpoint, settings.stage, _UNTRAINED[settings.stage])
+    device = choose_device(cfg.device)
+    set_matmul_precision(cfg.matmul_precision, device)
+    model = load_model(cfg.checkpoint, attention=cfg.attention, trust=trusted_packages(cfg.trust))
+    model = model.to(device)
+    _check_channels(model, cfg.checkpoint)
+    new_cameras = cameras_to_render(cfg.views, model, cfg.checkpoint)
+    scene_id = scene.stem if scene.is_file() else scene.name
+    truth = read_truth(Path(cfg.truth), scene_id) if cfg.truth else None
+    room = _read(cfg, world, settings, model)
+    found = _find(cfg, model, room, scene_id, with_shapes=settings.stage not in _WITHOUT_SHAPES)
+    write_scene(
+        output,
+        found,
+        room.views,
+        room.frame_ids,
+        grid_extent=room.volumes.joint().extent,
+        num_overlays=cfg.num_overlays,
+        turntable=cfg.turntable,
+        truth=truth,
+    )
+    if new_cameras is not None:
+        render_views(model, room, new_cameras, output, views_at_once=cfg.views_at_once)
+    _report(output, found)
+    return output
+
+
+def predict_scene(model: RayTran, views: Views, **limits: Unpack[Limits]) -> PredictedScene:
+    """Run the network on the views of one scene, in one volume, and make all that ``write_scene`` writes.
+
+    Args:
+        model: the network, on any device.
+        views: B = 1.
+        limits: see ``predict_volume``.
+
+    Returns:
+        The result, on the CPU.
+    """
+    with observe_attention(model) as observed:
+        prediction = predict_volume(model, views, **limits)
+    volumes = viewed_volumes(model, views, prediction, observed, grid_extent=model.grid_extent)
+    return PredictedScene(prediction, object_meshes(prediction), volumes=volumes)
+
+
+def _find(
+    cfg: DictConfig, model: RayTran, room: RoomViews, scene_id: str, *, with_shapes: bool
+) -> PredictedScene:
+    """Return the objects of a scene with what is made of them, and for the viewer how the network read it."""
+    with observe_attention(model) if cfg.viewer else nullcontext() as observed:
+        prediction = predict_room(
+            model,
+            room,
+            scene_id=scene_id,
+            score_threshold=cfg.score_threshold,
+            duplicate_iou=cfg.duplicate_iou,
+            views_at_once=cfg.views_at_once,
+            with_shapes=with_shapes,
+        )
+    volumes = None
+    if cfg.viewer:
+        several = len(room.members) > 1
+        parts = tuple(zip(room.volumes.center, room.members, strict=True)) if several else ()
+        extent = room.volumes.joint().extent
+        volumes = viewed_volumes(model, room.views, prediction, observed, grid_extent=extent, parts=parts)
+    found = PredictedScene(prediction, object_meshes(prediction), volumes=volumes)
+    return found.with_cads(Path(cfg.cads)) if cfg.cads else found
+
+
+def _read(cfg: DictConfig, world: WorldSettings, settings: PredictionSettings, model: RayTran) -> RoomViews:
+    """Return the frames that the network is given, and its volumes."""
+    with open_scene(Path(cfg.scene).resolve(), format=cfg.format, settings=world) as scan:
+        return read_room(
+            scan,
+            frames=cfg.frames,
+            num_views=cfg.num_views or settings.num_views,
+            image_size=settings.image_size,
+            resolution=model.grid_resolution,
+            extent=model.grid_extent,
+        )
+
+
+def _check_channels(model: RayTran, checkpoint: str) -> None:
+    """Raise if the network wants masks beside the images."""
+    if model.backbone.resnet.input_channels != RGB:
+        raise ConfigError(
+            f"{checkpoint} was trained with the true masks as a fourth channel, which only annotated scenes "
+            "have: use it with python -m raytran.evaluate, or give a checkpoint that was trained without"
+        )
+
+
+def _report(output: Path, found: PredictedScene) -> None:
+    count, meshes = len(found.prediction.objects), sum(mesh is not None for mesh in found.meshes)
+    if count:
+        _LOG.info("%s: %d objects, %d of them with a mesh", found.prediction.scene_id, count, meshes)
+    else:
+        _LOG.info(
+            "%s: no object has a score above the threshold; lower score_threshold to see weaker ones",
+            found.prediction.scene_id,
+        )
+    _LOG.info("wrote %s: %s", output.resolve(), ", ".join(sorted(path.name for path in output.iterdir())))
+    if found.volumes is not None:
+        _LOG.info("look at it: python -m raytran.view %s", shlex.quote(str(output)))

@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write a data set to disk, or check one."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from raytran.data.prepare import PrepareSettings, Released, prepare_scan2cad
+from raytran.errors import ConfigError
+from raytran.rooms.benchmark import generate_rooms_v1, generate_rooms_v1_furniture
+from raytran.rooms.generate import generate_rooms
+from raytran.rooms.report import report_on_rooms
+from raytran.rooms.sweethome3d.furniture import import_furniture
+from raytran.run.prepare.check import check
+from raytran.run.train.build import plain
+
+_log = logging.getLogger(__name__)
+
+_COUNTS = ("num_train", "num_val", "num_test")
+_CHOSEN = ("seed", "frames", "image_size", "min_objects", "max_objects", "room_size")
+"""What can be chosen of free rooms only."""
+
+_FIXED = "rooms-v1 is the same for everybody; dataset=rooms makes rooms of your choice"
+
+
+def prepare(cfg: DictConfig) -> Any:
+    """Run ``python -m raytran.prepare``; see ``conf/prepare.yaml``.
+
+    Returns:
+        The report of what was written, or with ``check`` whether nothing needs mending.
+
+    Raises:
+        ConfigError: the data set is unknown, or a path is missing.
+        DataError: the input is missing or damaged, or ``output`` was begun with other settings.
+    """
+    if cfg.check is not None:
+        return check(cfg)
+    if cfg.dataset not in _DATASETS:
+        raise ConfigError(f"unknown dataset={cfg.dataset}: choose one of {', '.join(_DATASETS)}")
+    if cfg.output is None:
+        raise ConfigError("output= is missing: give the folder to write to")
+    return _DATASETS[cfg.dataset](plain(cfg), Path(cfg.output))
+
+
+def _rooms(settings: dict[str, Any], output: Path) -> Any:
+    _refuse(settings, "num_test", because="dataset=rooms has no test rooms, dataset=rooms-v1 has")
+    settings = _with_the_presets(settings)
+    report = generate_rooms(
+        output,
+        cads=_path(settings["cads"]),
+        processes=settings["processes"],
+        **{name: settings[name] for name in ("num_train", "num_val", *_CHOSEN)},
+    )
+    _log.info("rooms are in %s; train on them with data.root=%s", output.resolve(), output)
+    return report
+
+
+def _rooms_v1(settings: dict[str, Any], output: Path) -> Any:
+    _refuse(settings, *_CHOSEN, because=_FIXED)
+    _refuse(settings, "cads", because="given CAD models go with dataset=rooms-v1-furniture")
+    report = generate_rooms_v1(output, processes=settings["processes"], **_given(settings, *_COUNTS))
+    _log.info("%s\nthe rooms are in %s", report_on_rooms(report.root), report.root)
+    _log.info("train on them with data=rooms-v1 data.root=%s, then evaluate … split=test", output)
+    return report
+
+
+def _rooms_v1_furniture(settings: dict[str, Any], output: Path) -> Any:
+    _refuse(settings, *_CHOSEN, because=_FIXED)
+    _refuse(settings, "num_train", "num_val", because="rooms-v1-furniture has test rooms only")
+    if settings["cads"] is None:
+        raise ConfigError("cads= is missing: give the folder that prepare dataset=cads wrote")
+    numbers = _given(settings, "num_test")
+    report = generate_rooms_v1_furniture(
+        output, cads=Path(settings["cads"]), processes=settings["processes"], **numbers
+    )
+    _log.info("%s\nthe rooms are in %s; evaluate on them with", report_on_rooms(report.root), report.root)
+    _log.info("python -m raytran.evaluate checkpoint=CKPT data=scan2cad data.root=%s split=test", output)
+    return report
+
+
+def _refuse(settings: dict[str, Any], *names: str, because: str) -> None:
+    given = _given(settings, *names)
+    if given:
+        raise ConfigError(f"leave out {', '.join(f'{name}=' for name in given)}: {because}")
+
+
+def _given(settings: dict[str, Any], *names: str) -> dict[str, Any]:
+    return {name: settings[name] for name in names if settings[name] is not None}
+
+
+def _with_the_presets(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings with those of the preset's rooms where none was given."""
+    return settings | {name: value for name, value in settings["rooms"].items() if settings[name] is None}
+
+
+def _scan2cad(settings: dict[str, Any], output: Path) -> Any:
+    if settings["scannet"] is None:
+        raise ConfigError("scannet= is missing: give the folder of ScanNet's scans")
+    height, width = _with_the_presets(settings)["image_size"]
+    released = Released(
+        scannet=Path(settings["scannet"]),
+        shapenet=_path(settings["shapenet"]),
+        scan2cad=_path(settings["scan2cad"]),
+        scenes=settings["scenes"],
+        splits=settings["splits"],
+    )
+    prepared = prepare_scan2cad(
+        output,
+        released,
+        PrepareSettings((height, width), settings["max_frames"], settings["masks"]),
+        grid_extent=tuple(settings["grid_extent"]),
+        processes=settings["processes"],
+    )
+    _log.info("\n%s\nthe scans are in %s; train on them with", prepared.text, prepared.root)
+    _log.info("python -m raytran.train data=scan2cad data.root=%s", output)
+    return prepared
+
+
+def _cads(settings: dict[str, Any], output: Path) -> Any:
+    if settings["source"] is None:
+        raise ConfigError("source= is missing: give the folder of the furniture libraries (*.sh3f)")
+    report = import_furniture(Path(settings["source"]), output, processes=settings["processes"])
+    _log.info("models are in %s; furnish rooms with them: dataset=rooms cads=%s", output.resolve(), output)
+    return report
+
+
+def _path(value: str | None) -> Path | None:
+    return None if value is None else Path(value)
+
+
+_DATASETS: dict[str, Callable[[dict[str, Any], Path], Any]] = {
+    "rooms": _rooms,
+    "rooms-v1": _rooms_v1,
+    "rooms-v1-furniture": _rooms_v1_furniture,
+    "scan2cad": _scan2cad,
+    "cads": _cads,
+}
+"""Name of a data set → what writes it."""

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a config to the objects that it describes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import lightning.pytorch as pl
+import torch
+from hydra.utils import instantiate
+from lightning.pytorch.callbacks import TQDMProgressBar
+from omegaconf import DictConfig, OmegaConf
+
+from raytran.checkpoints.runs import LAST
+from raytran.checkpoints.weights import without_sources
+from raytran.errors import ConfigError
+from raytran.run.train.loggers import METRICS
+from raytran.run.train.settings import RunConfig
+from raytran.run.train.watch import watching_callbacks
+from raytran.training.callbacks.effective_batch import EffectiveBatch
+from raytran.training.callbacks.last_checkpoint import LastCheckpoint
+from raytran.training.callbacks.rank_agreement import RankAgreement
+from raytran.training.callbacks.repeated_frames import RepeatedFramesWarning
+from raytran.training.callbacks.stage_setup import StageSetup
+from raytran.training.callbacks.step_progress import StepProgress
+from raytran.training.checkpoint_io import AtomicCheckpointIO
+from raytran.training.datamodule import SceneDataModule
+from raytran.training.metrics_table import MetricsTable
+from raytran.training.ranks import SyncedBatchNorm
+from raytran.training.reconstruction import Reconstruction
+
+if TYPE_CHECKING:
+    from raytran.model import RayTran
+
+PRECISIONS = ("auto", "bf16-mixed", "16-mixed", "32-true")
+DETERMINISTIC = (True, False, "warn")
+
+
+def plain(node: Any) -> Any:
+    """Return a config node as plain Python, interpolations resolved."""
+    return OmegaConf.to_container(node, resolve=True)
+
+
+def build_model(cfg: DictConfig, *, pretrained: bool = True) -> RayTran:
+    """Return the network.
+
+    Args:
+        cfg: the root config.
+        pretrained: False leaves out the image encoder's own weights, because a checkpoint will fill it.
+    """
+    config = plain(cfg.model)
+    return instantiate(config if pretrained else without_sources(config), _convert_="all")
+
+
+def build_module(cfg: DictConfig, model: RayTran) -> Reconstruction:
+    """Return the LightningModule around ``model``."""
+    return Reconstruction(
+        model=model,
+        loss=instantiate(cfg.loss, _convert_="all"),
+        stage=instantiate(cfg.stage, _convert_="all"),
+        optimization=instantiate(cfg.optimizer, _convert_="all"),
+        compiled=cfg.compile,
+    )
+
+
+def build_data(cfg: DictConfig) -> SceneDataModule:
+    """Return the data module."""
+    return instantiate(cfg.data, _convert_="all")
+
+
+def choose_precision(precision: str, *, on_cpu: bool) -> str:
+    """Return what ``auto`` means: bf16-mixed on GPUs that compute with it, 16-mixed on others, else 32-true.
+
+    Raises:
+        ConfigError: there is no such precision, or none on a CPU.
+    """
+    if precision not in PRECISIONS or (on_cpu and precision == "16-mixed"):
+        choices = [name for name in PRECISIONS if not (on_cpu and name == "16-mixed")]
+        raise ConfigError(f"unknown precision={precision} here: choose one of {', '.join(choices)}")
+    if precision != "auto":
+        return precision
+    if on_cpu:
+        return "32-true"
+    return "bf16-mixed" if torch.cuda.is_bf16_supported(including_emulation=False) else "16-mixed"
+
+
+def build_trainer(cfg: DictConfig, run: RunConfig, card: dict[str, Any]) -> pl.Trainer:
+    """Return Lightning's Trainer with the callbacks of every run.
+
+    Args:
+        cfg: the root config.
+        run: the same config's switches.
+        card: what each checkpoint carries.
+
+    Raises:
+        ConfigError: a setting has no meaning.
+    """
+    settings = plain(cfg.trainer)
+    if settings["deterministic"] not in DETERMINISTIC:  # Lightning takes anything else for false
+        raise ConfigError(
+            f"unknown trainer.deterministic={settings['deterministic']}: choose true, false or warn"
+        )
+    on_cpu = settings["accelerator"] == "cpu" or not torch.cuda.is_available()
+    settings["precision"] = choose_precision(str(settings["precision"]), on_cpu=on_cpu)
+    # Lightning counts batches here, and the configs steps.
+    settings["val_check_interval"] *= settings["accumulate_grad_batches"]
+    folder = Path(run.output_dir)
+    callbacks: list[pl.Callback] = [
+        StageSetup(),
+        EffectiveBatch(per_device=cfg.data.batch_size, expected=cfg.schedule.batch),
+        RankAgreement(),
+        RepeatedFramesWarning(),
+        LastCheckpoint(folder / LAST, every_n_steps=run.checkpoint_every, card=card),
+        *watching_callbacks(cfg, run, card),
+    ]
+    if run.progress_bar == "rich":
+        callbacks.append(StepProgress(f"stage {card['stage']}"))
+    elif run.progress_bar == "tqdm":
+        callbacks.append(TQDMProgressBar())
+    loggers = [instantiate(logger, _convert_="all") for logger in plain(cfg.logger).values()]
+    return instantiate(
+        settings,
+        default_root_dir=str(folder),
+        logger=[MetricsTable(folder / METRICS), *loggers],
+        callbacks=callbacks,
+        plugins=[AtomicCheckpointIO(), SyncedBatchNorm(on_cpu=on_cpu)],
+        enable_progress_bar=run.progress_bar == "tqdm",
+        _convert_="all",
+    )

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The three stages of training, one after another (RayTran §4); killed anywhere, it goes on where it was."""
+
+from __future__ import annotations
+
+import json
+import logging
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from raytran.checkpoints.runs import LAST, read_finished, write_finished
+from raytran.data.atomic import write_json
+from raytran.errors import ConfigError, RaytranError
+from raytran.run.entry import compose, quoted, typed_config_dir, user_environment
+from raytran.run.train.fit import FitResult, train
+from raytran.training.callbacks.stop_signals import SIGNALS
+
+_log = logging.getLogger(__name__)
+
+STAGES = ("stage1", "stage2", "stage3")
+RECORD = "curriculum.json"
+_OWN = ("stages", "output_dir", "resume")
+
+
+def curriculum(cfg: DictConfig) -> list[FitResult]:
+    """Run ``python -m raytran.curriculum``: the overrides typed there hold for every stage."""
+    overrides = [
+        item for item in HydraConfig.get().overrides.task if item.split("=")[0].lstrip("+~") not in _OWN
+    ]
+    return run_curriculum(overrides, output_dir=Path(cfg.output_dir), stages=tuple(cfg.stages))
+
+
+def run_curriculum(
+    overrides: Sequence[str], *, output_dir: Path, stages: Sequence[str] = STAGES
+) -> list[FitResult]:
+    """Train the stages in turn, each from the weights of the one before.
+
+    Each stage is a fit of its own in ``output_dir/<experiment>``. A stage that has finished is skipped, one
+    that was interrupted goes on from its last checkpoint.
+
+    Args:
+        overrides: settings for all stages as typed after ``python -m raytran.train``, without ``experiment``.
+        output_dir: folder of the curriculum.
+        stages: experiments, in order.
+
+    Raises:
+        ConfigError: ``overrides`` names an experiment, or the folder holds a curriculum with other settings.
+    """
+    if any(item.startswith("experiment=") for item in overrides):
+        raise ConfigError(f"a curriculum runs the experiments {list(stages)}: choose them with stages=[…]")
+    _record(output_dir, overrides, stages)
+    results: list[FitResult] = []
+    for number, experiment in enumerate(stages, start=1):
+        _log.info("stage %d of %d: experiment=%s", number, len(stages), experiment)
+        folder = output_dir / experiment
+        settings = [*overrides, f"experiment={experiment}", f"output_dir={quoted(folder)}", "resume=auto"]
+        if results:
+            settings.append(f"init_from={quoted(results[-1].checkpoint)}")
+        results.append(_fit(settings, folder))
+    write_finished(
+        output_dir,
+        stage="curriculum",
+        preset=_preset(overrides),
+        experiment="curriculum",
+        steps=results[-1].steps,
+    )
+    _log.info("curriculum finished: %s", results[-1].checkpoint)
+    return results
+
+
+def _fit(settings: Sequence[str], folder: Path) -> FitResult:
+    """Train one stage: in this process on one device, else as a command of its own.
+
+    Raises:
+        RaytranError: the command failed.
+    """
+    cfg = compose("train", settings)
+    if str(cfg.trainer.devices) == "1" and cfg.trainer.num_nodes == 1:
+        return train(cfg)
+    code = _run([sys.executable, "-m", "raytran.train", *_config_dir(), *settings])
+    finished = read_finished(folder)
+    if code != 0 or finished is None:
+        raise RaytranError(
+            f"the stage in {folder} stopped with exit code {code}: mend what it says above, "
+            "then give the same command again to continue"
+        )
+    return FitResult(folder, folder / LAST, finished.steps, 0.0, {})
+
+
+def _config_dir() -> list[str]:
+    return typed_config_dir(HydraConfig.get()) if HydraConfig.initialized() else []
+
+
+def _run(command: Sequence[str]) -> int:
+    """Run a command and return its exit code; pass signals to stop on to it, and stop after it."""
+    stopped_by = 0
+    with subprocess.Popen(command, env=user_environment()) as process:
+
+        def pass_on(signum: int, frame: FrameType | None) -> None:
+            nonlocal stopped_by
+            stopped_by = signum
+            if signum != signal.SIGINT:  # Ctrl-C reaches all processes of a terminal
+                process.send_signal(signum)
+
+        earlier = {signum: signal.signal(signum, pass_on) for signum in SIGNALS}
+        try:
+            code = process.wait()
+        finally:
+            for signum, handler in earlier.items():
+                signal.signal(signum, handler)
+    if stopped_by and code != 0:
+        raise SystemExit(128 + stopped_by)
+    return code
+
+
+def _record(output_dir: Path, overrides: Sequence[str], stages: Sequence[str]) -> None:
+    """Write down the settings of a new curriculum; refuse to continue one that had others."""
+    path = output_dir / RECORD
+    settings = {"overrides": sorted(overrides), "stages": list(stages)}
+    if path.is_file():
+        earlier = _read_record(path)
+        if earlier != settings:
+            typed = " ".join(earlier["overrides"]) or "no overrides"
+            raise ConfigError(
+                f"{output_dir} holds an unfinished curriculum that was started with {typed}: "
+                "give the same to continue it, or resume=none to start a new one"
+            )
+        return
+    write_json(path, settings)
+
+
+def _read_record(path: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(path.read_text()))
+    except (ValueError, TypeError) as error:
+        raise ConfigError(f"{path} is damaged: delete it and give the same command again") from error
+
+
+def _preset(overrides: Sequence[str]) -> str:
+    return str(compose("train", [*overrides, "output_dir=none"]).preset)

@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One stage, one fit: start it, continue it, mark it as finished."""
+
+from __future__ import annotations
+
+import logging
+import time
+import warnings
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import lightning.pytorch as pl
+from lightning.pytorch.utilities import rank_zero_only
+from lightning.pytorch.utilities.exceptions import SIGTERMException
+from omegaconf import DictConfig, OmegaConf
+
+from raytran.checkpoints.checkpoint import checkpoint_card, load_weights, parts_afresh
+from raytran.checkpoints.file import read_checkpoint, read_newest
+from raytran.checkpoints.known_data import KnownData
+from raytran.checkpoints.provenance import provenance
+from raytran.checkpoints.runs import LAST, one_at_a_time, read_finished, write_finished
+from raytran.data.atomic import write_json, write_text
+from raytran.errors import CheckpointError, ConfigError
+from raytran.run.device import cudnn_warning, set_matmul_precision
+from raytran.run.train.build import build_data, build_model, build_module, build_trainer, plain
+from raytran.run.train.memory import explained_out_of_memory
+from raytran.run.train.parent import Parent, check_parent, find_parent
+from raytran.run.train.settings import RunConfig
+from raytran.run.train.start_report import changed_settings, start_report
+from raytran.training.callbacks.stop_signals import StopRequestedError
+from raytran.training.reconstruction import Reconstruction
+from raytran.training.stage import Stage
+
+if TYPE_CHECKING:
+    from raytran.model import RayTran
+
+_log = logging.getLogger(__name__)
+
+RANDOM_ENCODER = (
+    "IMAGE ENCODER STARTS FROM RANDOM WEIGHTS: model.backbone.resnet.weights=auto found no ImageNet weights"
+)
+"""In every checkpoint that comes of such a start, those of later stages included."""
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """A finished fit.
+
+    Attributes:
+        folder: of the run.
+        checkpoint: its final checkpoint.
+        steps: optimiser steps taken in all.
+        seconds: time of this fit, 0 if the run had finished before.
+        metrics: the last logged values, by name.
+    """
+
+    folder: Path
+    checkpoint: Path
+    steps: int
+    seconds: float
+    metrics: dict[str, float]
+
+
+def train(cfg: DictConfig) -> FitResult:
+    """Train one stage as ``conf/train.yaml`` describes it.
+
+    Returns:
+        The finished fit; at once if ``resume`` leads to a run that has finished already.
+
+    Raises:
+        ConfigError: settings contradict each other or the parent stage is missing.
+        CheckpointError: a checkpoint is missing, damaged, or of another stage.
+        DataError: the data are missing or damaged.
+    """
+    run = RunConfig.read(cfg)
+    folder = Path(run.output_dir)
+    with one_at_a_time(folder) if _is_first_rank() else nullcontext():
+        return _finished_before(run, folder) or _train(cfg, run, folder)
+
+
+def _train(cfg: DictConfig, run: RunConfig, folder: Path) -> FitResult:
+    """Train what is left to train."""
+    pl.seed_everything(run.seed, workers=True, verbose=False)
+    _quiet()
+    config = plain(cfg)
+    start = _start(cfg, run)
+    module = start.module
+    card = checkpoint_card(
+        stage=module.stage.name,
+        preset=run.preset,
+        config=config,
+        parent=start.parent,
+        warnings=start.warnings,
+    )
+    trainer = build_trainer(cfg, run, card)
+    device = trainer.strategy.root_device
+    set_matmul_precision(run.matmul_precision, device)
+    data = build_data(cfg)
+    if trainer.is_global_zero:
+        _describe_run(cfg, folder)
+    _log.info("stage %s, %d steps, in %s", module.stage.name, trainer.max_steps, folder)
+    for line in start_report(module.stage, module.model, card, trust=run.trust):
+        _log.info("%s", line)
+    warning = cudnn_warning(device, str(trainer.precision))
+    if warning is not None:
+        _log.warning("%s", warning)
+    began = time.monotonic()
+    try:
+        with explained_out_of_memory(cfg):
+            trainer.fit(module, data, ckpt_path=start.resume_from)
+    except StopRequestedError as stop:
+        # One rank tells the shell; Lightning and torchrun would take codes of the others for a crash.
+        raise SystemExit(128 + stop.signum if trainer.is_global_zero else 0) from stop
+    except SystemExit as stop:
+        # Before the first step, or at the second Ctrl-C, Lightning turns a signal into an exit of its own.
+        raise SystemExit(143 if isinstance(stop, SIGTERMException) else 130) from stop
+    seconds = time.monotonic() - began
+    if trainer.is_global_zero:
+        write_finished(
+            folder,
+            stage=module.stage.name,
+            preset=run.preset,
+            experiment=run.experiment,
+            steps=trainer.global_step,
+            data=KnownData.of_config(config).as_plain(),
+        )
+    metrics = {name: float(value) for name, value in trainer.logged_metrics.items()}
+    _log.info("stage %s finished after %.0f s: %s", module.stage.name, seconds, folder / LAST)
+    return FitResult(folder, folder / LAST, trainer.global_step, seconds, metrics)
+
+
+def _finished_before(run: RunConfig, folder: Path) -> FitResult | None:
+    """Return the result of a run that needs nothing more, None if there is work to do."""
+    finished = read_finished(folder)
+    if run.resume == "none":
+        if finished is not None or (folder / LAST).is_file():
+            raise ConfigError(
+                f"{folder} holds a run already: continue it with resume=auto or choose another output_dir"
+            )
+        return None
+    if finished is None:
+        return None
+    _log.info("%s has finished already (stage %s, %d steps)", folder, finished.stage, finished.steps)
+    return FitResult(folder, folder / finished.checkpoint, finished.steps, 0.0, {})
+
+
+class _Start(NamedTuple):
+    """Where a fit begins.
+
+    Attributes:
+        module: what is trained, with its weights.
+        resume_from: the checkpoint of the run to go on with, None for a new run.
+        parent: what is known of the checkpoint that the first weights came from, None if there is none.
+        warnings: what anybody who uses the weights should know of them.
+    """
+
+    module: Reconstruction
+    resume_from: Path | None
+    parent: dict[str, Any] | None
+    warnings: Sequence[str]
+
+
+def _start(cfg: DictConfig, run: RunConfig) -> _Start:
+    """Return the module with its weights, and where they are from."""
+    found = _to_continue(run)
+    if found is not None:
+        path, content = found
+        if "resume" not in content:
+            raise CheckpointError(
+                f"{path} holds weights but no state of training: start a new run with init_from={path}"
+            )
+        module = build_module(cfg, build_model(cfg, pretrained=False))
+        if content["stage"] != module.stage.name:
+            raise CheckpointError(
+                f"{path} is of stage {content['stage']}, not {module.stage.name}: choose the experiment "
+                f"that wrote it, or start a new run from its weights with init_from={path}"
+            )
+        load_weights(module.model, content, path)
+        _log.info("continuing from step %d of %s", content.get("global_step", 0), path)
+        for line in changed_settings(content.get("config") or {}, plain(cfg)):
+            _log.warning("continued with another setting, %s", line)
+        return _Start(module, path, content.get("parent"), content.get("warnings") or ())
+    stage = _stage(cfg)
+    start = find_parent(run, stage, KnownData.of_config(plain(cfg)))
+    if start is None:
+        model = build_model(cfg)
+        return _Start(build_module(cfg, model), None, None, _warnings(model))
+    path, content = start
+    parent = Parent.of(path, content)
+    check_parent(parent, stage, run.check_parent)
+    module = build_module(cfg, build_model(cfg, pretrained=False))
+    afresh = parts_afresh(module.model, content, stage.begins)
+    for part in afresh:
+        _log.info("%s starts at random: its parent has none that fits, and trained none", part)
+    load_weights(module.model, content, path, afresh=afresh)
+    return _Start(module, None, parent.as_plain(), content.get("warnings") or ())
+
+
+def _warnings(model: RayTran) -> list[str]:
+    """Return what is to be known of the weights that a network starts from without any parent."""
+    # An encoder of the user's own need not tell.
+    return [RANDOM_ENCODER] if getattr(model.backbone.resnet, "random_fallback", False) else []
+
+
+def _to_continue(run: RunConfig) -> tuple[Path, dict[str, Any]] | None:
+    """Return the checkpoint to go on from and its content, None for a new run."""
+    if run.resume == "none":
+        return None
+    if run.resume != "auto":
+        return Path(run.resume), read_checkpoint(Path(run.resume))
+    found = read_newest((Path(run.output_dir) / LAST).parent)
+    if found is None:
+        _log.info("nothing to continue: this is a new run")
+    return found
+
+
+def _stage(cfg: DictConfig) -> Stage:
+    return Stage(**{name: value for name, value in plain(cfg.stage).items() if name != "_target_"})
+
+
+def _describe_run(cfg: DictConfig, folder: Path) -> None:
+    """Write the resolved config and where the code comes from beside the results."""
+    write_text(folder / "config.yaml", OmegaConf.to_yaml(cfg, resolve=True))
+    write_json(folder / "provenance.json", provenance())
+
+
+def _is_first_rank() -> bool:
+    return getattr(rank_zero_only, "rank", 0) == 0
+
+
+def _quiet() -> None:
+    """Silence Lightning's advice where we decided on purpose, and all ranks but the first."""
+    if not _is_first_rank():
+        logging.getLogger("raytran").setLevel(logging.WARNING)
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logger = logging.getLogger(name)
+        logger.setLevel(logging.WARNING)
+        logger.handlers.clear()  # its own handler would print each line twice
+    for pattern in (
+        ".*does not have many workers.*",
+        ".*ended before the epoch ended.*",
+        ".*in eval mode at the start of training.*",
+        ".*isinstance.treespec, LeafSpec.*",
+        ".*smaller than the logging interval.*",
+        "Grad strides do not match bucket view strides.*",  # of a convolution to one channel
+        ".*recommended to use .*sync_dist=True.*",  # the metrics have gathered over the ranks themselves
+    ):
+        warnings.filterwarnings("ignore", message=pattern)

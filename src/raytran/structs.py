@@ -1,0 +1,335 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The structs of tensors that cross folders: what a batch, a network output and a prediction hold.
+
+Shape letters, used in every docstring of the project:
+
+====== =============================================== ====== ==================================
+``B``  scenes in a batch                               ``X Y Z`` voxels along the world's axes
+``N``  views (video frames) of a scene                 ``C``     channels of a feature
+``H W`` rows and columns of an image                   ``P``     pixel-voxel pairs
+``h w`` rows and columns of a feature map (stride 16)  ``Q``     object queries
+``M``  objects                                         ``K``     classes without padding (9)
+``S``  cells along one side of a shape grid (63)       ``L``     decoder layers
+====== =============================================== ====== ==================================
+
+Units, frames and signs are in ``CONVENTIONS.md``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+CLASSES: tuple[str, ...] = (
+    *("bathtub", "bookshelf", "cabinet", "chair", "display", "sofa", "table", "trashbin", "other"),
+)
+"""Class names in the order of their labels; a network adds the padding class behind them (RayTran §3.2)."""
+
+CLASS_BY_CATID: dict[str, str] = {
+    "02808440": "bathtub",
+    "02871439": "bookshelf",
+    "02933112": "cabinet",
+    "03001627": "chair",
+    "03211117": "display",
+    "04256520": "sofa",
+    "04379243": "table",
+    "02747177": "trashbin",
+}
+"""Class of each ShapeNet category (Scan2CAD EvaluateBenchmark.py); every other category is ``other``."""
+
+CLASS_COLORS: tuple[tuple[int, int, int], ...] = (
+    (23, 190, 207),
+    (140, 86, 75),
+    (255, 127, 14),
+    (31, 119, 180),
+    (148, 103, 189),
+    (214, 39, 40),
+    (44, 160, 44),
+    (227, 119, 194),
+    (127, 127, 127),
+)
+"""Red, green, blue in [0, 255] of each class, in the order of ``CLASSES``, in pictures and meshes alike."""
+
+PADDING: int = len(CLASSES)
+"""Label of the padding class: the query slot holds no object."""
+
+SHAPE_SIZE: int = 63
+"""Cells along each side of an object's shape grid (RayTran §3.2)."""
+
+SYMMETRY_INFINITE: int = 0
+"""Value of ``ObjectSet.symmetry`` for a body of revolution; 1, 2 and 4 are the number of equal turns."""
+
+
+_Struct = TypeVar("_Struct", bound="TensorStruct")
+
+
+@dataclass(frozen=True)
+class TensorStruct:
+    """A frozen dataclass of tensors (or of structs, or tuples of them) that moves between devices as one."""
+
+    def to(self: _Struct, device: torch.device | str, *, non_blocking: bool = False) -> _Struct:
+        """Return a copy with every tensor inside on ``device``."""
+        return self._map(lambda item: item.to(device, non_blocking=non_blocking))
+
+    def pin_memory(self: _Struct) -> _Struct:
+        """Return a copy with every tensor inside in page-locked memory (called by ``DataLoader``)."""
+        return self._map(lambda item: item.pin_memory())
+
+    def _map(self: _Struct, change: Callable[[Any], Any]) -> _Struct:
+        def visit(value: Any) -> Any:
+            if isinstance(value, Tensor | TensorStruct):
+                return change(value)
+            return tuple(visit(item) for item in value) if isinstance(value, tuple) else value
+
+        return replace(self, **{field.name: visit(getattr(self, field.name)) for field in fields(self)})
+
+    def _select(self: _Struct, count: int, index: Tensor) -> _Struct:
+        """Return rows of a struct whose fields all have ``count`` rows, or none."""
+        chosen = torch.arange(count, device=index.device)[index].tolist()
+
+        def pick(value: Any) -> Any:
+            if isinstance(value, tuple):
+                return tuple(value[i] for i in chosen) if value else ()
+            return None if value is None else value[index]
+
+        return replace(self, **{field.name: pick(getattr(self, field.name)) for field in fields(self)})
+
+
+@dataclass(frozen=True)
+class Views(TensorStruct):
+    """Posed images of ``B`` scenes.
+
+    Attributes:
+        images: ``(B, N, 3 or 4, H, W)`` RGB, uint8 in [0, 255] or floating point in [0, 1]; a fourth
+            channel is a foreground mask given as input (RayTran §4, "Perfect segmentation").
+        intrinsics: ``(B, N, 3, 3)`` camera matrices for images of size ``H × W``, in pixels.
+        world_from_camera: ``(B, N, 4, 4)`` poses.
+    """
+
+    images: Tensor
+    intrinsics: Tensor
+    world_from_camera: Tensor
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """``(H, W)`` of the images."""
+        return self.images.shape[-2], self.images.shape[-1]
+
+    def colors(self) -> Tensor:
+        """Return red, green and blue in [0, 1], ``(B, N, 3, H, W)`` in floating point."""
+        rgb = self.images[:, :, :3]
+        return rgb if rgb.is_floating_point() else rgb.float() / 255
+
+
+@dataclass(frozen=True)
+class ObjectSet(TensorStruct):
+    """The ``M`` objects of one scene, true or predicted, in the world of the scene's poses.
+
+    Attributes:
+        label: ``(M,)`` int64, index into ``CLASSES``.
+        center: ``(M, 3)`` centre of the object's box, metres.
+        size: ``(M, 3)`` full extents along the object's own axes (x width, y height, z depth), metres.
+        rotation: ``(M, 3, 3)`` world_from_object; if upright ``Rz(yaw) · B`` (``geometry.rotation``).
+        symmetry: ``(M,)`` int64, number of equal turns about the object's up axis: 1, 2, 4, or
+            ``SYMMETRY_INFINITE``. All ones for predictions.
+        score: ``(M,)`` confidence in [0, 1]; ones for ground truth.
+        shape: ``(M, S, S, S)`` or None, occupancy over the object's own box, indexed [x, y, z] in the object
+            frame; cell ``i`` spans ``[i/S - ½, (i+1)/S - ½] · size``. bool for ground truth, probability
+            in [0, 1] for predictions.
+        model_id: ``catid/id`` of each object's CAD model, or empty.
+        num_views: ``(M,)`` how many views saw each object's box, the mean over the box; None if not counted.
+    """
+
+    label: Tensor
+    center: Tensor
+    size: Tensor
+    rotation: Tensor
+    symmetry: Tensor
+    score: Tensor
+    shape: Tensor | None = None
+    model_id: tuple[str, ...] = ()
+    num_views: Tensor | None = None
+
+    def __len__(self) -> int:
+        return int(self.label.shape[0])
+
+    def select(self, index: Tensor) -> ObjectSet:
+        """Return the objects at ``index``, an int64 ``(M',)`` or bool ``(M,)`` tensor, in that order."""
+        return self._select(len(self), index)
+
+    @staticmethod
+    def empty() -> ObjectSet:
+        """Return a set of no objects."""
+        none = torch.zeros(0, dtype=torch.int64)
+        vectors = torch.zeros(0, 3)
+        return ObjectSet(none, vectors, vectors, torch.zeros(0, 3, 3), none, torch.zeros(0))
+
+
+@dataclass(frozen=True)
+class CadAlignments(TensorStruct):
+    """The ``M`` CAD models that stand in one scan, true or predicted, in the order of their file.
+
+    A point of ShapeNet's ``model_normalized.obj`` goes to ``translation + R(quaternion) · (scale · point)``
+    in the scan, the world of its poses. Numbers are float64.
+
+    Attributes:
+        catid: ShapeNet category of each model, eight digits.
+        id_cad: name of each model within its category.
+        translation: ``(M, 3)`` where the CAD's origin stands, metres.
+        quaternion: ``(M, 4)`` [w, x, y, z] as given, of any length and either sign.
+        scale: ``(M, 3)`` metres per CAD unit.
+        score: ``(M,)`` confidence; ones for ground truth.
+        half_extent: ``(M, 3)`` half the size of the CAD's box, CAD units; None for predictions without boxes.
+        center: ``(M, 3)`` centre of the CAD's box, CAD units; None for predictions.
+        symmetry: ``(M,)`` int64 as in ``ObjectSet``; None for predictions.
+        pose: ``(M, 4, 4)`` scan_from_cad as annotated; None for predictions.
+        annotated_scale: ``(M, 3)`` scale as annotated, of either sign; None for predictions.
+    """
+
+    catid: tuple[str, ...]
+    id_cad: tuple[str, ...]
+    translation: Tensor
+    quaternion: Tensor
+    scale: Tensor
+    score: Tensor
+    half_extent: Tensor | None = None
+    center: Tensor | None = None
+    symmetry: Tensor | None = None
+    pose: Tensor | None = None
+    annotated_scale: Tensor | None = None
+
+    def __len__(self) -> int:
+        return len(self.catid)
+
+    @property
+    def model_id(self) -> tuple[str, ...]:
+        """``catid/id`` of each model."""
+        return tuple(f"{catid}/{name}" for catid, name in zip(self.catid, self.id_cad, strict=True))
+
+    @property
+    def category(self) -> tuple[str, ...]:
+        """Class of each model."""
+        return tuple(CLASS_BY_CATID.get(catid, "other") for catid in self.catid)
+
+    def select(self, index: Tensor) -> CadAlignments:
+        """Return the models at ``index``, an int64 ``(M',)`` or bool ``(M,)`` tensor, in that order."""
+        return self._select(len(self), index)
+
+    @staticmethod
+    def empty() -> CadAlignments:
+        """Return the predictions of a scene in which nothing was found."""
+        none = torch.zeros(0, 10, dtype=torch.float64)
+        return CadAlignments((), (), none[:, :3], none[:, :4], none[:, :3], none[:, 0])
+
+
+@dataclass(frozen=True)
+class SceneBatch(TensorStruct):
+    """Input and targets of ``B`` scenes. Targets that were not asked for are None.
+
+    Attributes:
+        scene_id: name of each scene, e.g. ``scene0470_00``.
+        views: the posed images.
+        frame_id: per scene, the name of each frame's file without its ending.
+        grid_center: ``(B, 3)`` centre of each scene's voxel grid, metres: the mean camera position.
+        objects: the annotated objects of each scene.
+        occupancy: ``(B, X, Y, Z)`` bool, voxel holds part of an object.
+        foreground: ``(B, N, H, W)`` bool, amodal mask of all objects together.
+        new_views: other posed images of the scenes, to be rendered from ``views``.
+    """
+
+    scene_id: tuple[str, ...]
+    views: Views
+    frame_id: tuple[tuple[str, ...], ...]
+    grid_center: Tensor
+    objects: tuple[ObjectSet, ...] | None = None
+    occupancy: Tensor | None = None
+    foreground: Tensor | None = None
+    new_views: Views | None = None
+
+
+@dataclass(frozen=True)
+class RawObjects(TensorStruct):
+    """Output of one decoder layer for every query slot.
+
+    Attributes:
+        class_logits: ``(B, Q, K + 1)``, padding last.
+        center: ``(B, Q, 3)`` box centre in the world, metres.
+        log_size: ``(B, Q, 3)`` natural logarithm of the sizes in metres.
+        yaw_vector: ``(B, Q, 2)`` (sin, cos) of the yaw, not normalised.
+        embedding: ``(B, Q, C)`` query embedding, from which shapes are decoded.
+    """
+
+    class_logits: Tensor
+    center: Tensor
+    log_size: Tensor
+    yaw_vector: Tensor
+    embedding: Tensor
+
+
+@dataclass(frozen=True)
+class RawProposals(TensorStruct):
+    """What every voxel says about an object centred in it: where proposal queries come from.
+
+    Attributes:
+        anchor: ``(B, X, Y, Z, 3)`` centre of each voxel in the world, metres.
+        class_logits: ``(B, X, Y, Z, K)`` logits, one per class, of an object's centre lying in the voxel.
+        center: ``(B, X, Y, Z, 3)`` box centre in the world, metres.
+        log_size: ``(B, X, Y, Z, 3)`` natural logarithm of the sizes in metres.
+        yaw_vector: ``(B, X, Y, Z, 2)`` (sin, cos) of the yaw, not normalised.
+    """
+
+    anchor: Tensor
+    class_logits: Tensor
+    center: Tensor
+    log_size: Tensor
+    yaw_vector: Tensor
+
+
+@dataclass(frozen=True)
+class RawScene(TensorStruct):
+    """What the network returns for the tasks it was asked to do; None for the others.
+
+    Attributes:
+        grid_center: ``(B, 3)`` centre of the voxel grids used, metres.
+        occupancy: ``(B, X, Y, Z)`` logits.
+        foreground: ``(B, N, H, W)`` logits.
+        objects: one ``RawObjects`` per decoder layer, last layer last.
+        proposals: where the queries of ``objects`` come from; None if they are learned.
+        new_views: ``(B, V, 3, H, W)`` logits of red, green and blue.
+        copies: as ``objects``, of noisy copies of the true ones; slot i is of object i modulo M.
+    """
+
+    grid_center: Tensor
+    occupancy: Tensor | None = None
+    foreground: Tensor | None = None
+    objects: tuple[RawObjects, ...] | None = None
+    proposals: RawProposals | None = None
+    new_views: Tensor | None = None
+    copies: tuple[RawObjects, ...] | None = None
+
+
+@dataclass(frozen=True)
+class ScenePrediction(TensorStruct):
+    """The result for one scene.
+
+    Attributes:
+        scene_id: name of the scene.
+        objects: predicted objects, highest score first, with ``shape`` probabilities if they were decoded.
+        grid_center: ``(3,)`` centre of the voxel grid, metres.
+        occupancy: ``(X, Y, Z)`` probability, or None.
+        foreground: ``(N, H, W)`` probability, or None.
+        seen: ``(X, Y, Z)`` int32, how many views have a ray through each voxel, or None.
+        new_views: ``(V, 3, H, W)`` rendered colours in [0, 1], or None.
+    """
+
+    scene_id: str
+    objects: ObjectSet
+    grid_center: Tensor
+    occupancy: Tensor | None = None
+    foreground: Tensor | None = None
+    seen: Tensor | None = None
+    new_views: Tensor | None = None

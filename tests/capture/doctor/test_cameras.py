@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every way in which cameras are commonly wrong is told from the images alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from raytran.capture.doctor.camera_findings import NO_READING
+from raytran.capture.doctor.cameras import _axis_turns, read_cameras
+from raytran.capture.doctor.finding import Correction
+from raytran.capture.doctor.matches import Matches
+
+from .conftest import OPENGL
+
+
+def scaled(x, y):
+    return lambda k: np.diag([x, y, 1.0]) @ k
+
+
+def focal(factor):
+    return lambda k: k * np.array([[factor, 1, 1], [1, factor, 1], [1, 1, 1]])
+
+
+SPOILED_POSES = {
+    "OpenGL camera axes": lambda p: p @ OPENGL,
+    "PyTorch3D camera axes": lambda p: p @ np.diag([-1.0, -1.0, 1.0, 1.0]),
+    "inverted poses": np.linalg.inv,
+    "inverted poses and OpenGL camera axes": lambda p: np.linalg.inv(p @ OPENGL),
+    "transposed poses": lambda p: p.transpose(0, 2, 1),
+    "robot camera axes (x forward, z up)": lambda p: (
+        p @ np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]])
+    ),
+}
+SPOILED_INTRINSICS = {
+    "intrinsics for another image size": [scaled(2.025, 2.0167), scaled(0.5, 0.5), scaled(0.85, 0.85)],
+    "wrong focal length": [focal(1.3), focal(0.75)],
+}
+
+
+def causes(reading):
+    return [finding.cause for finding in reading.findings if finding.state == "fault"]
+
+
+def test_true_cameras_are_not_flagged(recording, matches):
+    reading = read_cameras(recording, matches)
+    assert causes(reading) == []
+    assert not reading.correction.changes_cameras
+    assert [finding.state for finding in reading.findings] == ["ok", "ok"]
+
+
+@pytest.mark.parametrize("cause", SPOILED_POSES)
+def test_spoiled_poses_are_named_and_mended(recording, matches, cause):
+    spoiled = replace(recording, stored=SPOILED_POSES[cause](recording.stored))
+    reading = read_cameras(spoiled, matches)
+    assert causes(reading) == [cause]
+    mended, true = reading.correction.apply(spoiled.stored), recording.stored
+    # Up to a turn of the whole world, to which images are blind.
+    relative = np.linalg.inv(mended[:-1]) @ mended[1:]
+    np.testing.assert_allclose(relative, np.linalg.inv(true[:-1]) @ true[1:], atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("cause", "spoil"), [(cause, spoil) for cause, spoils in SPOILED_INTRINSICS.items() for spoil in spoils]
+)
+def test_spoiled_intrinsics_are_named_and_mended(recording, matches, cause, spoil):
+    reading = read_cameras(replace(recording, intrinsics=spoil(recording.intrinsics)), matches)
+    assert causes(reading) == [cause]
+    mended = reading.correction.intrinsics
+    np.testing.assert_allclose(np.diag(mended)[:2], np.diag(recording.intrinsics)[:2], rtol=0.05)
+    assert "multiply" in reading.findings[1].fix or "give fx" in reading.findings[1].fix
+
+
+def test_poses_and_intrinsics_may_be_wrong_together(recording, matches):
+    spoiled = replace(
+        recording, stored=recording.stored @ OPENGL, intrinsics=scaled(2.025, 2.0167)(recording.intrinsics)
+    )
+    assert causes(read_cameras(spoiled, matches)) == [
+        "OpenGL camera axes",
+        "intrinsics for another image size",
+    ]
+
+
+def test_any_turn_of_the_axes_is_found(recording, walk):
+    poses, intrinsics, matches, _ = walk
+    turns = _axis_turns()
+    assert len(turns) == 24
+    assert len({turn.tobytes() for turn in turns}) == 24
+    for turn in turns[::3]:
+        spoiled = poses.copy()
+        spoiled[:, :3, :3] = poses[:, :3, :3] @ turn.T
+        reading = read_cameras(replace(recording, stored=spoiled, intrinsics=intrinsics), matches)
+        np.testing.assert_array_equal(reading.correction.apply(spoiled), poses)
+        assert reading.agrees.all()
+
+
+def test_poses_of_other_frames_are_no_reading(recording, matches):
+    rng = np.random.default_rng(0)
+    mixed = recording.stored[rng.permutation(len(recording))]
+    reading = read_cameras(replace(recording, stored=mixed), matches)
+    assert causes(reading) == [NO_READING]
+    assert reading.findings[1].state == "unknown"
+
+
+def test_few_matches_tell_nothing(recording, matches):
+    few = Matches(matches.frame[:20], matches.pixel[:20], matches.tolerance_px)
+    reading = read_cameras(replace(recording, stored=np.linalg.inv(recording.stored)), few)
+    assert [finding.state for finding in reading.findings] == ["unknown", "unknown"]
+    assert (
+        reading.correction.apply(recording.stored).tolist() == Correction().apply(recording.stored).tolist()
+    )
+    assert not reading.agrees.any()

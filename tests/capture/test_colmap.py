@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""COLMAP models, binary and text, whole and damaged."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from raytran.capture.colmap import find_model, read_colmap
+from raytran.capture.imported import from_files
+from raytran.errors import DataError
+
+from .forms import write_colmap
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_cameras_and_images_are_those_that_were_written(walk, binary):
+    write_colmap(walk, walk.folder / "sparse" / "0", binary=binary)
+    scan = from_files(read_colmap(walk.folder))
+    assert scan.scene_id == "walk"
+    assert scan.frame_id == tuple(str(n) for n in range(12))
+    np.testing.assert_allclose(scan.world_from_camera.numpy(), walk.poses, atol=1e-12)
+    assert scan.intrinsics.numpy()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist() == list(walk.camera)
+    assert scan.image_size == (48, 64)
+    assert scan.read_color(7)[0, 0].tolist() == [140] * 3
+    assert scan.color_bytes(7) == (walk.folder / "images" / "7.png").read_bytes()
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_pycolmap_reads_the_same(walk, binary, tmp_path):
+    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap, the oracle, is not installed")
+    folder = walk.folder / "sparse" / "0"
+    write_colmap(
+        walk, folder, binary=binary, model="OPENCV", parameters=[*walk.camera, -0.1, 0.02, 0.001, 0.002]
+    )
+    for ending in ("bin", "txt"):
+        (folder / f"points3D.{ending}").write_bytes(b"\0" * 8 if ending == "bin" else b"")
+    # Its own reader, and what its own writer writes, in the form of its release (with rigs and frames).
+    model = pycolmap.Reconstruction(str(folder))
+    (tmp_path / "again").mkdir()
+    (model.write_text if binary else model.write_binary)(str(tmp_path / "again"))
+    for place in (folder, tmp_path / "again"):
+        shots = {shot.image.name: shot for shot in read_colmap(place).shots}
+        assert len(shots) == len(model.images) == 12
+        for image in model.images.values():
+            inverse = np.linalg.inv(shots[image.name].world_from_camera)[:3]
+            np.testing.assert_allclose(inverse, image.cam_from_world().matrix(), atol=1e-9)
+
+
+def test_the_model_is_found_where_tools_put_it(walk):
+    for place in ("sparse/0", "colmap/sparse/0", "sparse"):
+        write_colmap(walk, walk.folder / place, binary=True)
+        assert find_model(walk.folder) == walk.folder / place
+        # The folder of the model itself may be given: images are found above it.
+        assert len(from_files(read_colmap(walk.folder / place))) == 12
+        shutil.rmtree(walk.folder / place.split("/")[0])
+    assert find_model(walk.folder) is None
+
+
+def test_of_several_models_the_largest_is_read(walk):
+    few = replace(walk, names=walk.names[:3], poses=walk.poses[:3])
+    write_colmap(few, walk.folder / "sparse" / "0", binary=True)
+    write_colmap(walk, walk.folder / "sparse" / "1", binary=True)
+    assert len(read_colmap(walk.folder).shots) == 12
+
+
+def test_images_without_poses_and_poses_without_images_are_counted(walk):
+    write_colmap(walk, walk.folder / "sparse" / "0", binary=True)
+    (walk.folder / "images" / "3.png").unlink()
+    shutil.copy(walk.folder / "images" / "4.png", walk.folder / "images" / "99.png")
+    scan = from_files(read_colmap(walk.folder))
+    assert scan.dropped == {"3": "no image", "99": "no pose"}
+    assert len(scan) == 11
+
+
+def test_smaller_copies_of_the_images_scale_the_lens(walk):
+    large = replace(walk, image_size=(96, 128), camera=tuple(2 * value for value in walk.camera))
+    write_colmap(large, walk.folder / "sparse" / "0", binary=False)
+    scan = from_files(read_colmap(walk.folder))
+    assert scan.image_size == (48, 64)
+    assert scan.intrinsics[0, 0].item() == pytest.approx(walk.camera[0])
+
+
+def test_a_lens_that_distorts_is_resampled(walk):
+    write_colmap(
+        walk, walk.folder / "sparse" / "0", binary=True, model="SIMPLE_RADIAL", parameters=[50, 31, 25, 0.2]
+    )
+    scan = from_files(read_colmap(walk.folder))
+    assert scan.color_bytes(0) is None
+    assert scan.read_color(5, (24, 32)).shape == (24, 32, 3)
+    assert scan.intrinsics[0, 0].item() > 50
+
+
+def test_fisheyes_are_refused(walk):
+    model = {"model": "OPENCV_FISHEYE", "parameters": [50, 50, 32, 24, 0.1, 0, 0, 0]}
+    write_colmap(walk, walk.folder / "sparse" / "0", binary=True, **model)
+    with pytest.raises(DataError, match=r"OPENCV_FISHEYE, a fisheye.*image_undistorter"):
+        read_colmap(walk.folder)
+    write_colmap(walk, walk.folder / "text", binary=False, **model)
+    with pytest.raises(DataError, match=r"OPENCV_FISHEYE, a fisheye.*image_undistorter"):
+        read_colmap(walk.folder / "text")
+
+
+def test_every_cut_of_a_binary_file_is_one_sentence(walk):
+    folder = walk.folder / "sparse" / "0"
+    write_colmap(walk, folder, binary=True)
+    for name in ("cameras.bin", "images.bin"):
+        whole = (folder / name).read_bytes()
+        for length in (0, 7, 8, 11, 40, len(whole) // 2, len(whole) - 1):
+            (folder / name).write_bytes(whole[:length])
+            with pytest.raises(DataError, match=f"{name} ends early or is damaged: export the model again"):
+                read_colmap(walk.folder)
+        (folder / name).write_bytes(whole)
+    # A count that no file can hold is not believed.
+    (folder / "images.bin").write_bytes(b"\xff" * 7 + whole[7:])
+    with pytest.raises(DataError, match="ends early"):
+        read_colmap(walk.folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("cameras.txt", "1 PINHOLE 64 48 50 51\n", "2 parameters for PINHOLE, not 4"),
+        ("cameras.txt", "one PINHOLE 64 48 50 51 31 25\n", "line 1 of .*cameras.txt is no camera"),
+        ("cameras.txt", "2 PINHOLE 64 48 50 51 31 25\n", "camera 1, which cameras.txt does not have"),
+        ("cameras.txt", "1 PINHOLE 100000 100000 50 51 50000 50000\n", "images of 100000x100000"),
+        ("images.txt", "1 1 0 0 0 0 0 x 1 0.png\n\n", "line 1 of .*images.txt is no image"),
+        ("images.txt", "1 1 0 0 0 0 0 0 1\n\n", "line 1 of .*images.txt is no image"),
+        ("images.txt", "# nothing\n", "holds no images: COLMAP registered none"),
+        ("images.txt", "1 1 0 0 0 0 0 0 1 ../../secret.png\n\n", "which is outside .*relative paths"),
+        ("images.txt", "1 1 0 0 0 0 0 0 1 /etc/secret.png\n\n", "which is outside .*relative paths"),
+    ],
+)
+def test_what_is_wrong_in_text_is_named(walk, name, text, message):
+    folder = walk.folder / "sparse" / "0"
+    write_colmap(walk, folder, binary=False)
+    (folder / name).write_text(text)
+    with pytest.raises(DataError, match=message):
+        read_colmap(walk.folder)
+
+
+def test_no_model_and_no_images(walk):
+    with pytest.raises(DataError, match="holds no COLMAP model: wanted are cameras and images"):
+        read_colmap(walk.folder)
+    write_colmap(walk, walk.folder / "sparse" / "0", binary=True)
+    shutil.rmtree(walk.folder / "images")
+    with pytest.raises(DataError, match=r"none of the 12 frames .*\(12 no image\): check that its images"):
+        from_files(read_colmap(walk.folder))
+
+
+def test_images_of_another_shape_are_refused(walk):
+    write_colmap(
+        replace(walk, image_size=(64, 48), camera=(50, 51, 25, 31)), walk.folder / "sparse", binary=True
+    )
+    with pytest.raises(
+        DataError, match=r"image 0 is 64x48 and its intrinsics .* for 48x64, turned by 90°: give"
+    ):
+        from_files(read_colmap(walk.folder))

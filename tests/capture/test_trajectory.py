@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pose tracks read, and the pose between two of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from raytran.capture.trajectory import in_seconds, poses_at, read_camera, read_track
+from raytran.errors import DataError
+
+from .forms import tum_line, words
+
+
+@pytest.fixture
+def turning():
+    """Ten poses, a tenth of a second apart, of a camera that turns and moves evenly."""
+    poses = np.tile(np.eye(4), (10, 1, 1))
+    poses[:, :3, :3] = Rotation.from_rotvec(np.outer(np.arange(10), [0, 0, 0.1])).as_matrix()
+    poses[:, :3, 3] = np.outer(np.arange(10), [0.1, 0.2, 0.3])
+    return poses
+
+
+@pytest.fixture
+def track(turning, tmp_path):
+    path = tmp_path / "trajectory.txt"
+    # Not in the order of time, and with a comment.
+    lines = [tum_line(5 + n / 10, pose) for n, pose in enumerate(turning)]
+    path.write_text("# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines[::-1]) + "\n")
+    return read_track(path)
+
+
+def test_tum_lines_are_read_in_the_order_of_time(track, turning):
+    np.testing.assert_allclose(track.times, 5 + np.arange(10) / 10)
+    np.testing.assert_allclose(track.world_from_camera, turning, atol=1e-12)
+
+
+def test_between_two_poses_the_pose_is_interpolated(track):
+    poses = poses_at(track, np.array([5.25, 5.9, 4.998]))
+    np.testing.assert_allclose(poses[0, :3, 3], [0.25, 0.5, 0.75])
+    np.testing.assert_allclose(poses[0, :3, :3], Rotation.from_rotvec([0, 0, 0.25]).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(poses[1], track.world_from_camera[9])
+    # 2 ms before the first pose is its time.
+    np.testing.assert_allclose(poses[2], track.world_from_camera[0])
+    assert np.isnan(poses_at(track, np.array([4.9, 6.0]))).all()
+
+
+def test_over_a_long_gap_there_is_no_pose(track, tmp_path):
+    lines = (tmp_path / "trajectory.txt").read_text().splitlines()
+    (tmp_path / "trajectory.txt").write_text("\n".join(lines[:4] + lines[8:]))
+    poses = poses_at(read_track(tmp_path / "trajectory.txt"), np.array([5.0, 5.3, 5.75]))
+    assert np.isfinite(poses).all(axis=(1, 2)).tolist() == [True, False, True]
+
+
+def test_a_lost_pose_is_no_pose(track, tmp_path):
+    text = (tmp_path / "trajectory.txt").read_text().splitlines()
+    text[1] = text[1].split(" ")[0] + " nan nan nan 0 0 0 1"
+    text[2] = " ".join(text[2].split(" ")[:4]) + " 0 0 0 0"
+    (tmp_path / "trajectory.txt").write_text("\n".join(text))
+    poses = poses_at(read_track(tmp_path / "trajectory.txt"), np.array([5.9, 5.8, 5.7]))
+    assert np.isfinite(poses).all(axis=(1, 2)).tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize("rows", [3, 4])
+def test_matrices_have_no_times(turning, tmp_path, rows):
+    path = tmp_path / "poses.txt"
+    path.write_text("\n".join(words(pose[:rows].ravel()) for pose in turning))
+    track = read_track(path)
+    assert track.times is None
+    np.testing.assert_allclose(track.world_from_camera, turning)
+    np.testing.assert_allclose(poses_at(track, np.array([3.0])), turning[3:4])
+
+
+def test_nanoseconds_and_microseconds_are_told_by_their_size():
+    assert in_seconds(np.array([1403636579763555584.0]))[0] == pytest.approx(1403636579.7635555, abs=1e-6)
+    assert in_seconds(np.array([1403636579763555.0]))[0] == pytest.approx(1403636579.763555, abs=1e-6)
+    assert in_seconds(np.array([1403636579.7, 0.5])).tolist() == [1403636579.7, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "is no pose track: each line must hold `timestamp"),
+        ("1 2 3\n", "is no pose track"),
+        ("1 2 3 4 5 6 7 8\n1 2\n", "does not hold as many numbers in each line"),
+        ("one 2 3 4 5 6 7 8\n", "does not hold as many numbers in each line"),
+        ("\udcff", "does not hold as many numbers"),
+    ],
+)
+def test_what_is_no_track(tmp_path, text, message):
+    (tmp_path / "a.txt").write_bytes(text.encode("utf-8", errors="surrogateescape"))
+    with pytest.raises(DataError, match=message):
+        read_track(tmp_path / "a.txt")
+
+
+def test_intrinsics_in_every_form(tmp_path):
+    path = tmp_path / "intrinsics.txt"
+    expected = [50.0, 51.0, 31.0, 25.0]
+    for text in (
+        "50 51 31 25",
+        "50, 51, 31, 25",
+        "50 0 31\n0 51 25\n0 0 1",
+        "50 0 31 0\n0 51 25 0\n0 0 1 0\n0 0 0 1",
+    ):
+        path.write_text(text)
+        lens = read_camera(path, (48, 64))
+        assert [*lens.focal, *lens.center] == expected
+        assert lens.is_pinhole
+    path.write_text("50 51 31 25 -0.1 0.02 0.003 0.004 0.005")
+    lens = read_camera(path, (48, 64))
+    assert (lens.radial, lens.tangential) == ((-0.1, 0.02, 0.005), (0.003, 0.004))
+    path.write_text("50 51")
+    with pytest.raises(DataError, match="holds no intrinsics: write `fx fy cx cy` of the stored images"):
+        read_camera(path, (48, 64))
+    path.write_text("500 510 310 250")
+    with pytest.raises(DataError, match=r"principal point at \(310\.0, 250\.0\).*of the stored images"):
+        read_camera(path, (48, 64))

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import json
+import logging
+
+import pytest
+
+from raytran.rooms import ensure as rooms
+from raytran.rooms.ensure import ensure_rooms, ensure_rooms_v1
+from raytran.run.entry import compose
+from raytran.run.train.build import build_data
+
+
+@pytest.fixture
+def made(monkeypatch):
+    """Record the calls of the generator instead of making rooms."""
+    calls = []
+    for name in ("generate_rooms", "generate_rooms_v1"):
+        monkeypatch.setattr(rooms, name, lambda output, **settings: calls.append(settings))
+    return calls
+
+
+def write_set(folder, scans, present):
+    scannet = folder / "scannet"
+    (scannet / "scans").mkdir(parents=True)
+    (folder / "rooms.json").write_text(json.dumps({"num_train": 1, "num_val": 1, "seed": 0}))
+    (scannet / "scannetv2_train.txt").write_text(f"{scans[0]}\n")
+    (scannet / "scannetv2_val.txt").write_text(f"{scans[1]}\n")
+    for scan in present:
+        (scannet / "scans" / scan).mkdir()
+
+
+def test_rooms_are_made_on_first_use(tmp_path, made):
+    ensure_rooms(tmp_path / "rooms", num_train=2, num_val=1)
+    assert made == [{"num_train": 2, "num_val": 1}]
+
+
+def test_a_whole_set_is_used_as_it_is(tmp_path, made, caplog):
+    write_set(tmp_path, ("a", "b"), present=("a", "b"))
+    with caplog.at_level(logging.WARNING):
+        ensure_rooms(tmp_path, num_train=1, num_val=1, seed=0)
+        assert not caplog.records
+        ensure_rooms(tmp_path, num_train=5, num_val=1, seed=0)
+    assert made == []
+    assert "made with num_train=1" in caplog.text
+
+
+def test_an_interrupted_set_is_completed(tmp_path, made):
+    write_set(tmp_path, ("a", "b"), present=("a",))
+    ensure_rooms(tmp_path, num_train=1, num_val=1)
+    assert len(made) == 1
+
+
+def test_a_whole_benchmark_is_used_and_a_smaller_one_is_completed(tmp_path, made):
+    write_set(tmp_path, ("a", "b"), present=("a", "b", "c"))
+    asked = {"num_train": 1, "num_val": 1, "num_test": 1}
+    ensure_rooms_v1(tmp_path, **asked)
+    assert len(made) == 1  # the list of test rooms is missing
+    (tmp_path / "scannet" / "scannetv2_test.txt").write_text("c\n")
+    for count in (0, 1):
+        ensure_rooms_v1(tmp_path, **(asked | {"num_test": count}))
+    assert len(made) == 1
+    ensure_rooms_v1(tmp_path, **(asked | {"num_test": 2}))
+    assert made[1:] == [asked | {"num_test": 2, "processes": 0, "progress": True}]
+
+
+def test_the_benchmark_as_training_data(made, tmp_path):
+    cfg = compose(
+        "train", ["data=rooms-v1", f"data.root={tmp_path}", "data.make.num_train=7", "output_dir=x"]
+    )
+    data = build_data(cfg)
+    data.prepare_data()
+    assert made == [{"num_train": 7, "num_val": 100, "num_test": 100, "processes": 0, "progress": True}]

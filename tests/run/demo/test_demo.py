@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demo runs from nothing to a page, goes on where it was, and keeps to its settings."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from omegaconf import DictConfig, OmegaConf
+
+from raytran.checkpoints.checkpoint import checkpoint_card
+from raytran.checkpoints.file import write_checkpoint
+from raytran.checkpoints.weights import shipped_weights
+from raytran.errors import ConfigError
+from raytran.run.demo.demo import _asked, demo
+from raytran.run.entry import compose
+from raytran.run.train.build import build_data, build_model, plain
+
+FEW = [
+    "rooms.num_train=1",
+    "rooms.num_val=1",
+    "rooms.frames=6",
+    "rooms.image_size=[60,80]",
+    "rooms.max_objects=4",
+    "rooms.processes=1",
+    "views.image_size=[48,64]",
+    "views.num_views=2",
+    "views.predict_views=3",
+    "schedule.occupancy.steps=2",
+    "schedule.joint.steps=2",
+    "schedule.shape.steps=2",
+    "schedule.log_every=1",
+    "progress_bar=none",
+]
+
+
+def config(output, *more: str) -> DictConfig:
+    values = {"preset": "tiny", "overrides": [*FEW, *more], "score_threshold": 0.5, "duplicate_iou": 0.25}
+    return OmegaConf.create({"output": str(output), **values})
+
+
+def test_a_network_of_ones_own_is_trusted_because_it_was_typed(tmp_path, mylab):
+    typed = [
+        *FEW,
+        "preset=tiny",
+        "model.backbone._target_=mylab.MyBackbone",
+        f"data.root={tmp_path / 'rooms'}",
+    ]
+    cfg = compose("train", [*typed, "experiment=stage3", "output_dir=unused"])
+    card = checkpoint_card(stage="shape", preset="tiny", config=plain(cfg), parent=None)
+    state = {f"model.{name}": value for name, value in build_model(cfg).state_dict().items()}
+    write_checkpoint(tmp_path / "last.ckpt", {**card, "state_dict": state})
+    asked = _asked(typed, build_data(cfg), tmp_path / "last.ckpt")
+    assert type(asked["train"].model.backbone).__module__ == "mylab.nets"
+
+
+@pytest.mark.slow
+def test_demo_from_nothing_to_a_page_and_again(tmp_path, caplog, capsys):
+    caplog.set_level("INFO")
+    output = tmp_path / "demo"
+    first = demo(config(output))
+    assert list(first.metrics) == ["train", "val", "shipped"][: 2 if shipped_weights() is None else 3]
+    assert first.page.read_text().count("<figure") == len(first.metrics) * 5 + 1
+    assert str(first.page) in capsys.readouterr().out.replace("\n", "")
+    checkpoint = output / "training" / "stage3" / "checkpoints" / "last.ckpt"
+    trained = checkpoint.stat().st_mtime_ns
+    for split, scene in (("train", "scene0000_00"), ("val", "scene0001_00")):
+        written = json.loads((output / "evaluation" / split / "metrics.json").read_text())
+        assert written["strict"] == first.metrics[split]["strict"]
+        assert json.loads((output / "predictions" / scene / "scene.json").read_text())["scene_id"] == scene
+    assert set(first.seconds) >= {"rooms", "training, stage1", "training, stage3", "evaluation", "prediction"}
+
+    again = demo(config(output))
+    assert checkpoint.stat().st_mtime_ns == trained, "finished stages are not trained again"
+    assert again.metrics == first.metrics
+    assert again.seconds["training, stage1"] == first.seconds["training, stage1"]
+    assert "finished already" in caplog.text
+
+    with pytest.raises(ConfigError, match="other settings"):
+        demo(config(output, "schedule.joint.steps=3"))

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The demo's page keeps training rooms and held-out rooms apart and shows what was found."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+import torch
+
+from raytran.run.demo.page import ShownScene, headline, write_page
+from raytran.run.predict.files import PredictedScene, write_scene
+from raytran.run.train.fit import FitResult
+from raytran.structs import CLASSES, ObjectSet, SceneBatch, ScenePrediction, Views
+
+UPRIGHT = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+
+
+def metrics(n_good: int) -> dict:
+    counts = {"n_good": 0, "n_total": 0, "accuracy": 0.0}
+    per_class = {name: dict(counts) for name in CLASSES}
+    per_class["chair"] = {"n_good": n_good, "n_total": 5, "accuracy": n_good / 5}
+    total = {
+        "n_good": n_good,
+        "n_total": 5,
+        "n_scenes": 1,
+        "global_average": n_good / 5,
+        "class_average": 0.0,
+    }
+    thresholds = {"0.25": {"f1": 0.75}, "0.5": {"f1": 0.5}}
+    return {
+        "strict": {"per_class": per_class, "per_threshold": thresholds, **total},
+        "occupancy_iou": 0.25,
+    }
+
+
+def scene(split: str, scene_id: str, output) -> ShownScene:
+    one = torch.ones(1, dtype=torch.int64)
+    center = torch.tensor([[0.0, 3.0, 0.0]])
+    objects = ObjectSet(3 * one, center, torch.ones(1, 3), UPRIGHT[None], one, torch.ones(1))
+    pose = torch.eye(4).repeat(3, 1, 1)
+    pose[:, :3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    intrinsics = torch.tensor([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]).expand(3, 3, 3)
+    views = Views(torch.zeros(1, 3, 3, 48, 64, dtype=torch.uint8), intrinsics[None], pose[None])
+    batch = SceneBatch(
+        scene_id=(scene_id,),
+        views=views,
+        frame_id=(("0", "90", "100"),),
+        grid_center=torch.zeros(1, 3),
+        objects=(objects,),
+        occupancy=torch.zeros(1, 4, 4, 4, dtype=torch.bool),
+        foreground=torch.zeros(1, 3, 48, 64, dtype=torch.bool),
+    )
+    prediction = ScenePrediction(
+        scene_id, objects, torch.zeros(3), occupancy=torch.rand(4, 4, 4), foreground=torch.rand(3, 48, 64)
+    )
+    folder = output / "predictions" / scene_id
+    extent = (6.0, 6.0, 3.0)
+    found = PredictedScene(prediction, [None])
+    write_scene(folder, found, views, batch.frame_id[0], grid_extent=extent, turntable=0, truth=objects)
+    return ShownScene(split, folder, batch, prediction, extent)
+
+
+def test_headline():
+    assert headline(metrics(4)) == {
+        "accuracy": "80%",
+        "objects": "4 of 5",
+        "F1 at IoU 0.25": "0.75",
+        "F1 at IoU 0.5": "0.50",
+        "occupancy IoU": "0.25",
+    }
+    assert headline(metrics(4) | {"shape": {"iou": 0.6}})["shape IoU"] == "0.60"
+    assert headline(metrics(0) | {"shape": {"iou": None}})["shape IoU"] == "–"
+
+
+@pytest.fixture
+def page(tmp_path) -> str:
+    logs = tmp_path / "training" / "stage1"
+    logs.mkdir(parents=True)
+    (logs / "metrics.csv").write_text("epoch,step,train/total\n0,1,2.0\n0,2,1.0\n")
+    fit = FitResult(logs, logs / "checkpoints" / "last.ckpt", 2, 1.0, {})
+    path = write_page(
+        tmp_path,
+        scenes=[scene("train", "scene0000_00", tmp_path), scene("val", "scene0001_00", tmp_path)],
+        metrics={"train": metrics(5), "val": metrics(1)},
+        fits=[fit],
+        seconds={"rooms": 3.0},
+    )
+    assert path == tmp_path / "index.html"
+    return re.sub(r"data:[^\"]+", "data:", path.read_text())
+
+
+def test_splits_are_told_apart(page):
+    training, held_out = page.index("<h3>Training rooms</h3>"), page.index("<h3>Held-out rooms</h3>")
+    assert training < page.index("5 of 5") < page.index("trained on these very rooms") < held_out
+    assert held_out < page.index("1 of 5") < page.index("has never seen these rooms")
+    assert "A training room: scene0000_00" in page
+    assert "A held-out room: scene0001_00" in page
+
+
+def test_pictures_and_files_are_there(page, tmp_path):
+    assert page.count('src="data:"') == 2 * 5 + 1
+    assert 'href="predictions/scene0001_00/scene.glb"' in page
+    assert (tmp_path / "predictions" / "scene0001_00" / "scene.glb").is_file()
+    assert 'href="training/stage1/checkpoints/last.ckpt"' in page

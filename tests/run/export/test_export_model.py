@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a checkpoint to a file to give away and back."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+import torch
+from safetensors import safe_open
+
+import raytran
+from raytran.checkpoints.checkpoint import prediction_settings
+from raytran.checkpoints.file import read_checkpoint, write_checkpoint
+from raytran.checkpoints.weights_file import write_weights
+from raytran.errors import CheckpointError, ConfigError
+from raytran.export.program import example_inputs
+from raytran.run.entry import compose
+from raytran.run.export.export_model import export_model
+from raytran.run.plan.camera_paths import walk
+from raytran.run.train.parent import Parent
+
+from ...factories import Trained
+
+
+def exported(trained, folder, *settings):
+    output = folder / "out" / "rooms.safetensors"
+    return export_model(
+        compose("export_model", [f"checkpoint={trained.path}", f"output={output}", *settings])
+    )
+
+
+def test_the_network_comes_back_bit_by_bit(trained, tmp_path):
+    path, model = exported(trained, tmp_path), trained.model
+    loaded = raytran.load(path)
+    assert not loaded.training
+    assert loaded.grid_resolution == (8, 8, 4)
+    state = loaded.state_dict()
+    assert all(torch.equal(value, state[name]) for name, value in model.state_dict().items())
+    assert prediction_settings(path) == prediction_settings(trained.path)
+    of_both = [Parent.of(file, read_checkpoint(file)) for file in (path, trained.path)]
+    assert (of_both[0].stage, of_both[0].step) == ("shape", 40)
+    assert of_both[0].scores["val/objects/f1_0.25"] == 0.5
+    assert of_both[0].scores == of_both[1].scores
+
+
+def test_the_header_says_what_is_inside_and_nothing_of_the_machine(trained, tmp_path):
+    with safe_open(exported(trained, tmp_path), framework="pt") as file:
+        text, names = file.metadata()["raytran"], set(file.keys())
+    assert names == set(trained.model.state_dict())
+    card = json.loads(text)
+    assert (card["stage"], card["preset"], card["global_step"]) == ("shape", "tiny", 40)
+    assert card["parent"] == {"stage": "joint", "step": 3}
+    assert card["versions"]["torch"] == torch.__version__
+    assert card["model"]["grid_resolution"] == [8, 8, 4]
+    assert "/home/me" not in text
+    assert str(tmp_path.parent) not in text
+
+
+@pytest.mark.parametrize(("dtype", "bits"), [("float16", 11), ("bfloat16", 8)])
+def test_half_the_size_rounds_the_weights(trained, tmp_path, dtype, bits):
+    whole = exported(trained, tmp_path).stat().st_size
+    half = exported(trained, tmp_path, f"dtype={dtype}")
+    assert half.stat().st_size < 0.52 * whole
+    state, exact = raytran.load(half).state_dict(), trained.model.state_dict()
+    for name, value in exact.items():
+        assert state[name].dtype == value.dtype
+        torch.testing.assert_close(state[name], value, rtol=2.0**-bits, atol=1e-7)
+
+
+def test_an_exported_file_is_exported_again(trained, tmp_path):
+    first = exported(trained, tmp_path, "dtype=bfloat16")
+    again = export_model(
+        compose("export_model", [f"checkpoint={first}", f"output={tmp_path / 'b.safetensors'}"])
+    )
+    a, b = (raytran.load(path).state_dict() for path in (first, again))
+    assert all(torch.equal(value, b[name]) for name, value in a.items())
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "message"),
+    [
+        (["dtype=int8"], ConfigError, "unknown dtype=int8: choose one of float32, float16, bfloat16"),
+        (["output=weights.onnx"], ConfigError, r"weights\.onnx has an unknown ending: choose .* or \.pt2"),
+        (["output=a.pt2", "dtype=float16"], ConfigError, r"dtype=float16 is for \.safetensors"),
+        (
+            ["output=a.pt2", "program.part=heads"],
+            ConfigError,
+            "unknown program.part=heads: choose one of network",
+        ),
+        (["checkpoint=none.ckpt"], CheckpointError, r"no checkpoint at none\.ckpt"),
+    ],
+)
+def test_mistakes_are_one_sentence_and_leave_nothing(trained, tmp_path, settings, error, message):
+    with pytest.raises(error, match=message):
+        exported(trained, tmp_path, *settings)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_is_not_exported_onto_itself(trained, tmp_path):
+    path = exported(trained, tmp_path)
+    for place, message in ((path, "is the checkpoint itself"), (path.parent, "unknown ending")):
+        with pytest.raises(ConfigError, match=message):
+            export_model(compose("export_model", [f"checkpoint={path}", f"output={place}", "dtype=float16"]))
+    (tmp_path / "folder.safetensors").mkdir()
+    with pytest.raises(ConfigError, match="is a folder"):
+        export_model(
+            compose("export_model", [f"checkpoint={path}", f"output={tmp_path / 'folder.safetensors'}"])
+        )
+
+
+@pytest.mark.parametrize(
+    ("value", "dtype", "message"),
+    [
+        (1e6, "float16", "beyond the range of float16: choose dtype=bfloat16"),
+        (float("nan"), "float32", "is not finite"),
+    ],
+)
+def test_weights_that_do_not_fit_are_named(trained, tmp_path, value, dtype, message):
+    content = torch.load(trained.path, weights_only=True)
+    content["state_dict"]["model.backbone.unseen"][0] = value
+    write_checkpoint(tmp_path / "last.ckpt", content)
+    with pytest.raises(CheckpointError, match=rf"model\.backbone\.unseen in .*last\.ckpt.*{message}"):
+        exported(Trained(tmp_path / "last.ckpt", None), tmp_path, f"dtype={dtype}")
+
+
+def put(path, content, **model):
+    """Write a file whose card asks for another network than its weights are of."""
+    card = {name: value for name, value in content.items() if name not in ("state_dict", "optimizer_states")}
+    state = {name.removeprefix("model."): value for name, value in content["state_dict"].items()}
+    write_weights(path, card | {"model": content["model"] | model}, state)
+
+
+def test_a_file_cannot_run_foreign_code(trained, tmp_path):
+    path = tmp_path / "bad.safetensors"
+    put(path, torch.load(trained.path, weights_only=True), heads={"_target_": "os.system", "command": "true"})
+    with pytest.raises(CheckpointError, match=r"bad\.safetensors asks to run 'os\.system'"):
+        raytran.load(path)
+
+
+def test_the_file_and_not_its_claim_decides_how_much_memory_is_taken(trained, tmp_path):
+    """A network of a terabyte is described: it is refused before memory for it is asked for."""
+    content = torch.load(trained.path, weights_only=True)
+    shape = content["model"]["heads"]["shape"] | {"widths": [1 << 17, 1 << 16, 64, 32]}
+    put(tmp_path / "huge.safetensors", content, heads=content["model"]["heads"] | {"shape": shape})
+    with pytest.raises(CheckpointError, match=r"huge\.safetensors \(preset tiny\) do not fit"):
+        raytran.load(tmp_path / "huge.safetensors")
+
+
+def test_without_output_it_says_what_is_inside(trained, capsys):
+    assert export_model(compose("export_model", [f"checkpoint={trained.path}"])) is None
+    words = capsys.readouterr().out
+    for said in ("stage joint, 3 steps", "M, float32", "val/objects/f1_0.25", "0.5", torch.__version__):
+        assert said in words, said
+    assert "val/objects/f1_0.25/chair" not in words
+
+
+def test_a_program_says_how_to_use_it(trained, tmp_path, caplog):
+    caplog.set_level("INFO")
+    words = [f"checkpoint={trained.path}", f"output={tmp_path / 'rooms.pt2'}", "program.tasks=occupancy"]
+    path = export_model(compose("export_model", words))
+    extra = {"raytran.json": ""}
+    program = torch.export.load(path, extra_files=extra).module()
+    about = json.loads(extra["raytran.json"])
+    assert (about["format"], about["operators"], about["stage"]) == ("raytran.program/1", "aten", "shape")
+    size = prediction_settings(trained.path).image_size
+    assert tuple(about["image_size"]) == size
+    inputs = example_inputs(trained.model, walk(2).scaled_to(size))
+    assert about["feature_size"] == [side // trained.model.backbone.stride for side in size]
+    with torch.no_grad():
+        assert program(*inputs)["occupancy"].shape == tuple(about["grid_resolution"])
+    assert float(re.search(r"differ from the network's by at most (\S+)", caplog.text)[1]) < 1e-4
+    with pytest.raises(CheckpointError, match=r"rooms\.pt2 is a program of torch\.export.*\.safetensors"):
+        raytran.load(path)
+
+
+def test_the_decoder_of_shapes_is_a_program_too(trained, tmp_path):
+    words = [f"checkpoint={trained.path}", f"output={tmp_path / 'shapes.pt2'}", "program.part=shapes"]
+    program = torch.export.load(export_model(compose("export_model", words))).module()
+    embedding = torch.randn(1, trained.model.backbone.channels)
+    with torch.no_grad():
+        torch.testing.assert_close(program(embedding), trained.model.eval().decode_shapes(embedding))

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The folder of a prediction: which files there are, and that the next program reads them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from raytran.data.shapenet.voxelize import voxelize_solid
+from raytran.export.scan2cad_csv import read_alignments_csv
+from raytran.geometry.rotation import rotation_from_yaw
+from raytran.postprocess import object_meshes
+from raytran.rooms.cad import CadModel, sample_model
+from raytran.rooms.shapenet_files import write_model
+from raytran.run.evaluate.files import read_predictions
+from raytran.run.predict.files import PredictedScene, write_scene
+from raytran.structs import CLASSES, ObjectSet, ScenePrediction, Views
+
+FILES = {"scene.json", "scene.glb", "meshes", "occupancy.ply", "topdown.png", "overlays"}
+
+
+@pytest.fixture(scope="module")
+def chair() -> CadModel:
+    return sample_model("chair", np.random.default_rng(3))
+
+
+@pytest.fixture
+def found(chair) -> PredictedScene:
+    """A chair, and a table whose shape is empty."""
+    shape = torch.from_numpy(voxelize_solid(chair.vertices, chair.faces, size=15)).float()
+    objects = ObjectSet(
+        label=torch.tensor([CLASSES.index("chair"), CLASSES.index("table")]),
+        center=torch.tensor([[0.0, 2.0, 0.5], [1.0, 2.5, 0.4]]),
+        size=torch.tensor([chair.size_m.tolist(), [1.0, 0.8, 0.6]]).float(),
+        rotation=rotation_from_yaw(torch.tensor([0.5, 0.0])),
+        symmetry=torch.ones(2, dtype=torch.int64),
+        score=torch.tensor([0.9, 0.6]),
+        shape=torch.stack([shape, torch.zeros_like(shape)]),
+    )
+    prediction = ScenePrediction("room", objects, torch.zeros(3), occupancy=torch.full((4, 4, 2), 0.7))
+    return PredictedScene(prediction, object_meshes(prediction))
+
+
+@pytest.fixture
+def views() -> Views:
+    pose = torch.eye(4)[None, None].repeat(1, 2, 1, 1)
+    pose[..., :3, :3] = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+    pose[0, :, 0, 3] = torch.tensor([0.0, 0.2])
+    intrinsics = torch.tensor([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]]).expand(1, 2, 3, 3)
+    return Views(torch.full((1, 2, 3, 48, 64), 200, dtype=torch.uint8), intrinsics, pose)
+
+
+def write(output: Path, found: PredictedScene, views: Views, turntable: int = 0) -> set[str]:
+    write_scene(
+        output,
+        found,
+        views,
+        ["0", "5"],
+        grid_extent=(4.0, 4.0, 2.0),
+        num_overlays=0,
+        turntable=turntable,
+    )
+    return {path.name for path in output.iterdir()}
+
+
+def test_the_turntable_is_there_if_wanted(tmp_path, found, views):
+    assert write(tmp_path / "still", found, views) == FILES
+    assert write(tmp_path / "turning", found, views, turntable=1) == FILES | {"turntable.gif"}
+
+
+def test_cad_models_are_named_placed_and_drawn(tmp_path, found, views, chair, caplog):
+    write_model(chair, tmp_path / "cads")
+    output = tmp_path / "room"
+    assert write(output, found.with_cads(tmp_path / "cads"), views) == FILES | {"scan2cad.csv", "cads.glb"}
+    first, second = json.loads((output / "scene.json").read_text())["objects"]
+    assert (first["catid_cad"], first["id_cad"]) == (chair.catid, chair.model_id)
+    assert "id_cad" not in second
+    alignments = read_alignments_csv(output / "scan2cad.csv")
+    assert alignments.model_id == (f"{chair.catid}/{chair.model_id}",)
+    # The chair is as large as it was made, so that one scale does for all axes: the diagonal of its box.
+    diagonal = float(np.linalg.norm(chair.size_m))
+    torch.testing.assert_close(alignments.scale, torch.full((1, 3), diagonal).double(), rtol=1e-5, atol=0)
+    drawn = trimesh.load(output / "cads.glb")
+    assert {"00_chair", "00_chair_box", "01_table_box"} == set(drawn.graph.nodes_geometry)
+    # `evaluate predictions=` reads the folder as one scene, once.
+    read = read_predictions(output, ["room"], {})
+    assert (list(read.scenes), read.ignored) == (["room"], ())

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a stage asks of the one before."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from raytran.checkpoints.checkpoint import checkpoint_card
+from raytran.checkpoints.file import write_checkpoint
+from raytran.checkpoints.known_data import KnownData
+from raytran.checkpoints.runs import LAST, write_finished
+from raytran.errors import CheckpointError, ConfigError
+from raytran.run.entry import compose
+from raytran.run.train.build import plain
+from raytran.run.train.fit import _stage
+from raytran.run.train.parent import Parent, check_parent, find_parent
+from raytran.run.train.settings import RunConfig
+
+
+def stage(experiment, *more):
+    return _stage(compose("train", ["preset=tiny", f"experiment={experiment}", "output_dir=unused", *more]))
+
+
+def parent(name, **scores):
+    return Parent(
+        "p.ckpt", name, 9, {f"val/{key.replace('__', '/')}": value for key, value in scores.items()}
+    )
+
+
+@pytest.mark.parametrize(
+    ("experiment", "found"),
+    [
+        ("stage1", parent("joint")),  # the first stage asks for nothing
+        ("stage2", parent("occupancy", occupancy__iou=0.2)),
+        ("stage2", parent("joint")),  # more of the same
+        ("stage3", Parent("p.ckpt", "joint", 9, {"val/objects/f1_0.25": 0.01})),
+        ("novel_view", parent("occupancy")),
+        ("novel_view", parent("joint")),
+        ("novel_view", parent("shape")),
+        ("novel_view", parent("view")),
+    ],
+)
+def test_a_parent_that_knows_its_task_will_do(experiment, found):
+    check_parent(found, stage(experiment), "scores")
+
+
+@pytest.mark.parametrize(
+    ("experiment", "found", "message"),
+    [
+        (
+            "stage2",
+            parent("occupancy", occupancy__iou=0.0312),
+            r"p\.ckpt has not learned occupancy: its validation occupancy/iou is 0\.0312 and must exceed "
+            r"0\.05 \(stage\.parent_minimum\): train experiment=stage1 longer, or force it with ",
+        ),
+        ("stage2", parent("occupancy", occupancy__iou=float("nan")), "is nan and must exceed"),
+        ("stage2", parent("occupancy"), "has never been validated, so that its occupancy/iou is unknown"),
+        (
+            "stage2",
+            parent("shape"),
+            "is of stage shape, but stage joint builds on occupancy: train experiment=stage1",
+        ),
+        ("stage3", parent("occupancy", occupancy__iou=0.9), "builds on joint: train experiment=stage2 first"),
+        ("stage3", Parent("p.ckpt", "joint", 9, {"val/objects/f1_0.25": 0.0}), "has not learned objects"),
+        ("stage2", parent("view"), "is of stage view, but stage joint builds on occupancy"),
+    ],
+)
+def test_others_are_refused_unless_forced(experiment, found, message, caplog):
+    with pytest.raises(CheckpointError, match=message) as refused:
+        check_parent(found, stage(experiment), "scores")
+    forced = re.search("check_parent=(stage|none)$", str(refused.value)).group(1)
+    check_parent(found, stage(experiment), forced)
+    assert ("builds on" in caplog.text) == (forced == "none")
+
+
+def test_the_stage_is_asked_for_without_the_scores():
+    check_parent(parent("occupancy"), stage("stage2"), "stage")
+    with pytest.raises(CheckpointError, match="builds on occupancy"):
+        check_parent(parent("shape"), stage("stage2"), "stage")
+
+
+def test_the_minimum_is_a_setting():
+    learned = parent("occupancy", occupancy__iou=0.2)
+    with pytest.raises(CheckpointError, match=r"must exceed 0\.3"):
+        check_parent(learned, stage("stage2", "stage.parent_minimum=0.3"), "scores")
+
+
+def test_what_is_remembered_of_a_parent():
+    content = {"stage": "occupancy", "global_step": 7, "scores": {"val/occupancy/iou": 0.5, "step": 6}}
+    found = Parent.of(Path("p.ckpt"), content)
+    assert found.as_plain() == {
+        "path": "p.ckpt",
+        "stage": "occupancy",
+        "step": 7,
+        "scores": {"val/occupancy/iou": 0.5, "step": 6.0},
+        "data": None,
+    }
+    known = {"name": "rooms", "root": "r", "annotation": "ab", "made": {"seed": 0}}
+    assert Parent.of(Path("p.ckpt"), content | {"data": known}).data == known
+    assert Parent.of(Path("p.ckpt"), {"stage": "occupancy"}).scores == {}
+    for odd in ({"scores": {"a": "b"}}, {"global_step": "many"}):
+        with pytest.raises(CheckpointError, match=r"p\.ckpt"):
+            Parent.of(Path("p.ckpt"), {"stage": "occupancy", **odd})
+
+
+def find(outputs, experiment, *more):
+    settings = ["preset=tiny", f"experiment={experiment}", "output_dir=unused", f"outputs={outputs}", *more]
+    cfg = compose("train", settings)
+    found = find_parent(RunConfig.read(cfg), _stage(cfg), KnownData.of_config(plain(cfg)))
+    return None if found is None else found[0]
+
+
+def finished(outputs, name, data, *, old=False):
+    """A finished stage 1; an old one does not say in its mark what it was trained on."""
+    run = outputs / "tiny" / "stage1" / name
+    config = plain(compose("train", ["preset=tiny", "output_dir=unused", *data]))
+    card = checkpoint_card(stage="occupancy", preset="tiny", config=config, parent=None)
+    write_checkpoint(run / LAST, {**card, "state_dict": {}})
+    known = None if old else card["data"]
+    write_finished(run, stage="occupancy", preset="tiny", experiment="stage1", steps=4, data=known)
+    return run / LAST
+
+
+def test_where_a_parent_is_looked_for(tmp_path):
+    assert find(tmp_path, "stage1") is None
+    assert find(tmp_path, "stage2", "init_from=none") is None
+    with pytest.raises(CheckpointError, match=r"no checkpoint at .*a\.ckpt"):
+        find(tmp_path, "stage1", f"init_from={tmp_path / 'a.ckpt'}")
+    with pytest.raises(ConfigError, match=r"`python -m raytran\.train experiment=stage2 preset=tiny` first"):
+        find(tmp_path, "stage3")
+
+
+@pytest.mark.parametrize("old", [False, True])
+def test_a_parent_on_other_data_is_passed_over(tmp_path, old):
+    rooms, real = ["data.root=rooms"], ["data=scan2cad", "data.root=real"]
+    other = finished(tmp_path, "a", rooms, old=old)
+    with pytest.raises(ConfigError) as refused:
+        find(tmp_path, "stage2", *real)
+    said = str(refused.value)
+    assert "was trained on scan2cad in real, only on other data (" in said
+    assert f"{other} on rooms in rooms)" in said
+    assert (
+        "run `python -m raytran.train experiment=stage1 preset=tiny data=scan2cad data.root=real` first"
+        in said
+    )
+    assert "init_from=CHECKPOINT to start from other data all the same" in said
+    assert find(tmp_path, "stage2", *real, f"init_from={other}") == other
+    assert find(tmp_path, "stage2", *rooms) == other
+    own = finished(tmp_path, "b", real, old=old)
+    finished(tmp_path, "c", rooms, old=old)
+    assert find(tmp_path, "stage2", *real) == own, "not the newest, which is on rooms"
+    with pytest.raises(
+        ConfigError, match=r"last\.ckpt on scan2cad in real and 1 more|rooms in rooms and 2 more"
+    ):
+        find(tmp_path, "stage2", "data=rooms-v1")
