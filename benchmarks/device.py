@@ -26,7 +26,7 @@ import raytran
 if TYPE_CHECKING:
     import lightning.pytorch as pl
 
-    from raytran.ops.triton.dispatch import Attention
+    from raytran.ops.tracer import Attention
 
 Run = Callable[[], object]
 

@@ -162,7 +162,7 @@ def random_batch(
     """Return ``scenes`` equal scenes of random images with ten objects each, and the targets asked for."""
     views = len(cameras.intrinsics)
     lead, size = (scenes, views), cameras.image_size
-    images = torch.randint(0, 256, (*lead, model.backbone.resnet.input_channels, *size), dtype=torch.uint8)
+    images = torch.randint(0, 256, (*lead, model.backbone.encoder.input_channels, *size), dtype=torch.uint8)
     poses = (cameras.intrinsics.float(), cameras.world_from_camera.float())
     center = cameras.position.float().mean(dim=0)
     objects = ObjectSet(

@@ -3,20 +3,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
+from torch import Tensor
 
-from raytran.backbone.backbone import Backbone
+from raytran.backbone.backbone import Backbone, VoxelBackbone
 from raytran.backbone.block import Stream
 from raytran.backbone.resnet import ResNet18
-from raytran.heads.foreground import ForegroundHead
+from raytran.extensions.denoising import DenoisingObjectHead
+from raytran.extensions.proposal_queries import ProposalQueries
+from raytran.geometry.camera import Cameras
+from raytran.geometry.grid import VoxelGrid
+from raytran.heads.dense import ForegroundHead, OccupancyHead
 from raytran.heads.objects import ObjectHead
-from raytran.heads.occupancy import OccupancyHead
 from raytran.heads.shape import ShapeHead
 from raytran.heads.view import ViewHead
 from raytran.model import RayTran
+from raytran.ops.ray_attention import Pairs
 from raytran.structs import ObjectSet, Views
 
 RESOLUTION, EXTENT, CHANNELS = (6, 6, 4), (6.0, 6.0, 3.0), 16
@@ -33,19 +39,21 @@ def make_model(
     num_copies: int = 0,
 ) -> RayTran:
     torch.manual_seed(0)
+    settings: dict[str, Any] = {
+        "channels": CHANNELS,
+        "num_heads": 2,
+        "num_layers": 2,
+        "num_queries": 5,
+        "hidden": 16,
+        "grid_extent": EXTENT,
+        "queries": ProposalQueries if queries == "proposal" else None,
+    }
     heads = {
         "occupancy": OccupancyHead(channels=CHANNELS),
         "foreground": ForegroundHead(channels=CHANNELS, widths=widths),
-        "objects": ObjectHead(
-            channels=CHANNELS,
-            num_heads=2,
-            num_layers=2,
-            num_queries=5,
-            queries=queries,
-            num_copies=num_copies,
-            hidden=16,
-            grid_extent=EXTENT,
-        ),
+        "objects": DenoisingObjectHead(num_copies=num_copies, **settings)
+        if num_copies
+        else ObjectHead(**settings),
         "shape": ShapeHead(channels=CHANNELS, widths=(8, 8, 4, 4)),
         "view": ViewHead(
             stream=Stream(channels=CHANNELS, num_heads=2, expansion=1, direction="voxels_to_pixels"),
@@ -53,8 +61,8 @@ def make_model(
             widths=widths,
         ),
     }
-    resnet = ResNet18(width=8, stride=stride, input_channels=input_channels)
-    backbone = Backbone(resnet=resnet, channels=CHANNELS, num_heads=2, num_blocks=2, expansion=1)
+    encoder = ResNet18(width=8, stride=stride, input_channels=input_channels)
+    backbone = Backbone(encoder=encoder, channels=CHANNELS, num_heads=2, num_blocks=2, expansion=1)
     return RayTran(backbone=backbone, heads=heads, grid_resolution=RESOLUTION, grid_extent=EXTENT)
 
 
@@ -86,3 +94,28 @@ class Trained(NamedTuple):
 
     path: Path
     model: RayTran
+
+
+def run_backbone(
+    backbone: VoxelBackbone,
+    images: Tensor,
+    cameras: Cameras,
+    grid: VoxelGrid,
+    trace: Callable[[Cameras], Pairs],
+    *,
+    views_at_once: int | None = None,
+    with_pixels: bool = True,
+) -> tuple[Tensor, Tensor | None]:
+    """Run a backbone on all views at once, or in chunks; pixel features come back in one tensor."""
+    count = images.shape[1]
+    step = views_at_once or count
+    chunks = [slice(start, start + step) for start in range(0, count, step)]
+    cameras_of = [cameras.select(chunk) for chunk in chunks]
+    voxels, pixels = backbone(
+        [images[:, chunk] for chunk in chunks],
+        cameras_of,
+        grid,
+        [trace(some) for some in cameras_of],
+        with_pixels=with_pixels,
+    )
+    return voxels, None if pixels is None else torch.cat(pixels, dim=1)

@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from raytran.extensions.unprojection import pair_centers
 from raytran.geometry.boxes import OrientedBoxes, box_iou
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
@@ -32,7 +33,6 @@ from raytran.metrics.functional.shape import chamfer_distance, surface_points
 from raytran.metrics.image import psnr_of_frames
 from raytran.metrics.new_views import nearest_frames
 from raytran.ops import reference
-from raytran.ops.center_tracer import pair_centers
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_attention import ray_attention
 from raytran.ops.splat import splat_features

@@ -63,13 +63,14 @@ SMALL = [
     "model.heads.objects.num_queries=8",
     "model.heads.shape.widths=[8,8,8,8]",
 ]
-_RESNET = ["model.backbone.resnet.width=8", "model.heads.foreground.widths=[8,8,8]"]
+DENOISING = "model/extensions=[proposal_queries,windowed_attention,denoising]"
+_RESNET = ["model.backbone.encoder.width=8", "model.heads.foreground.widths=[8,8,8]"]
 NETWORKS = {
     "raytran": ["preset=raytran", *_RESNET],
     "small": ["preset=small", *_RESNET],
     "laptop": ["preset=laptop", "model.heads.foreground.widths=[8,8]"],
     "tiny": ["preset=tiny", *_RESNET],
-    "unprojection": ["preset=tiny", "model=unprojection", *_RESNET],
+    "unprojection": ["preset=tiny", "model/backbone=unprojection", *_RESNET],
 }
 STAGES = ("stage1", "stage2", "stage3", "novel_view")
 
@@ -77,18 +78,23 @@ VARIATIONS = {
     # experiment, network, more settings, objects of each scene of the batch
     "two scenes, copies of learned queries": (
         *("stage2", "raytran"),
-        ["model.heads.objects.num_copies=5"],
+        [DENOISING],
         (3, 2),
     ),
     "an empty scene, copies of proposals": (
         *("stage2", "laptop"),
-        ["model.heads.objects.num_copies=5", "model.heads.objects.refines=box"],
+        ["model/extensions=[windowed_attention,denoising,box_refinement]"],
         (0, 2),
     ),
-    "no objects": ("stage2", "tiny", ["model.heads.objects.num_copies=5"], (0,)),
+    "no objects": (
+        "stage2",
+        "tiny",
+        [DENOISING],
+        (0,),
+    ),
     "no objects' shapes": ("stage3", "tiny", [], (0, 0)),
     "blocks computed twice": ("stage2", "tiny", ["model.backbone.checkpoint_blocks=true"], (3,)),
-    "masks as input": ("stage2", "tiny", ["model.backbone.resnet.input_channels=4"], (3,)),
+    "masks as input": ("stage2", "tiny", ["model.backbone.encoder.input_channels=4"], (3,)),
     "torch.sparse": ("stage2", "tiny", ["model.attention=sparse"], (3,)),
     "frozen norms, one direction": (
         *("stage2", "tiny"),
@@ -249,7 +255,7 @@ def test_other_networks_and_scenes(variation, tmp_path):
     experiment, network, settings, objects = VARIATIONS[variation]
     cfg = configured(experiment, network, *settings, "watch.pictures=0", "schedule.log_every=1")
     module = module_of(cfg)
-    targets, channels = targets_of(module.stage), module.model.backbone.resnet.input_channels
+    targets, channels = targets_of(module.stage), module.model.backbone.encoder.input_channels
     scenes = [
         scene_with(targets, objects=count, number=number, channels=channels)
         for number, count in enumerate(objects)
@@ -262,7 +268,12 @@ def test_other_networks_and_scenes(variation, tmp_path):
 
 @on_pretend_device
 def test_a_run_is_continued(tmp_path):
-    cfg = configured("stage2", "tiny", "watch.pictures=0", "model.heads.objects.num_copies=3")
+    cfg = configured(
+        "stage2",
+        "tiny",
+        "watch.pictures=0",
+        DENOISING,
+    )
     batches = [scene_with({"objects", "occupancy", "foreground"})] * 2
     fit(trainer_of(cfg, tmp_path / "begun", steps=1), module_of(cfg), batches)
     module, here = module_of(cfg), AllIsHere()
@@ -337,7 +348,7 @@ def test_a_step_on_the_kernels_equals_one_on_the_cpu(experiment):
         "model.rays_per_cell=2",
         "model.backbone.num_blocks=1",
         "model.heads.objects.num_heads=2",
-        "model.heads.objects.num_copies=3",
+        DENOISING,
     ]
     cfg = configured(experiment, "tiny", *settings)
     batch = scene_with({"objects", "occupancy", "foreground", "new_views"})

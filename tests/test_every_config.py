@@ -117,7 +117,7 @@ def test_the_papers_ablations_are_what_they_say():
     assert not any(parameter.requires_grad for parameter in model.heads["foreground"].parameters())
     assert "foreground" not in {*module.stage.tasks, *module.stage.terms, *config.data.targets}
     config = compose("train", ["preset=raytran", "experiment=gt_masks_stage3", "output_dir=x"])
-    assert build_model(config, pretrained=False).backbone.resnet.input_channels == 4
+    assert build_model(config, pretrained=False).backbone.encoder.input_channels == 4
     assert config.data.dataset.input_mask == "amodal"
 
 

@@ -15,6 +15,7 @@ LAYERS: list[set[str]] = [
     {"backbone", "heads"},
     {"model"},
     {"losses", "metrics", "data", "postprocess"},
+    {"extensions"},
     {"pictures"},
     {"checkpoints"},
     {"export", "training"},

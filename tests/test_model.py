@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from raytran.errors import ConfigError, ShapeError
+from raytran.extensions.denoising import DenoisingLoss
 from raytran.geometry.camera import Cameras
 from raytran.geometry.rotation import yaw_from_rotation
 from raytran.losses.matcher import HungarianMatcher
@@ -35,19 +36,23 @@ def test_only_what_was_asked_for() -> None:
 
 def test_copies_of_the_truth_are_corrected_in_training_alone() -> None:
     model, views, known = make_model(num_copies=4).train(), make_views(), (make_objects(3),)
-    raw = model(views, tasks=("objects",), known=known)
-    assert [layer.center.shape for layer in raw.copies] == [(1, 4, 3)] * 2
+    raw = model(views, tasks=("objects",), true_objects=known)
+    assert [layer.center.shape for layer in raw.denoising] == [(1, 4, 3)] * 2
     batch = SceneBatch(("a",), views, ((),), raw.grid_center, objects=known)
-    loss = TotalLoss(weights=WEIGHTS, matcher=HungarianMatcher(weights=WEIGHTS))
+    loss = TotalLoss(
+        weights=WEIGHTS,
+        matcher=HungarianMatcher(weights=WEIGHTS),
+        extensions={"denoising": DenoisingLoss()},
+    )
     losses = loss(raw, batch, terms=("objects",))
-    assert {f"objects/{name}/copies" for name in ("class", "center", "size", "yaw")} < set(losses)
+    assert {f"objects/{name}/denoising" for name in ("class", "center", "size", "yaw")} < set(losses)
     parts = [value for name, value in losses.items() if name != "total"]
     torch.testing.assert_close(losses["total"], torch.stack(parts).sum())
     losses["total"].backward()
-    assert model.heads["objects"].copies.embedding.grad.abs().sum() > 0
+    assert model.heads["objects"].denoising_queries.embedding.grad.abs().sum() > 0
     with torch.no_grad():
-        told, alone = model.eval()(views, known=known), model(views)
-    assert told.copies is None
+        told, alone = model.eval()(views, true_objects=known), model(views)
+    assert told.denoising is None
     assert torch.equal(told.objects[-1].center, alone.objects[-1].center)
 
 
@@ -206,12 +211,12 @@ def test_what_autocast_left_in_16_bits_is_decoded_outside_of_it() -> None:
 
 def test_predict_runs_in_eval_mode_without_gradients() -> None:
     model = make_model().train()
-    statistics = model.backbone.resnet.bn1.running_mean.clone()
+    statistics = model.backbone.encoder.bn1.running_mean.clone()
     prediction = model.predict(make_views(), scene_id="a")
     assert len(prediction.objects) == 5
     assert prediction.objects.score.tolist() == sorted(prediction.objects.score.tolist(), reverse=True)
     assert not prediction.objects.center.requires_grad
-    torch.testing.assert_close(model.backbone.resnet.bn1.running_mean, statistics)
+    torch.testing.assert_close(model.backbone.encoder.bn1.running_mean, statistics)
     assert prediction.foreground.shape == (2, 32, 48)
 
 

@@ -8,8 +8,7 @@ import torch
 
 from raytran.backbone.backbone import Backbone
 from raytran.backbone.resnet import ResNet18
-from raytran.heads.foreground import ForegroundHead
-from raytran.heads.occupancy import OccupancyHead
+from raytran.heads.dense import ForegroundHead, OccupancyHead
 from raytran.model import RayTran
 from raytran.ops.tracer import RayTracer
 from raytran.ops.triton import block_pairs
@@ -25,7 +24,7 @@ TASKS = ("occupancy", "foreground")
 def _model(attention: str = "sparse") -> RayTran:
     torch.manual_seed(0)
     backbone = Backbone(
-        resnet=ResNet18(width=8, input_channels=3), channels=16, num_heads=1, num_blocks=1, expansion=1
+        encoder=ResNet18(width=8, input_channels=3), channels=16, num_heads=1, num_blocks=1, expansion=1
     )
     heads = {
         "occupancy": OccupancyHead(channels=16),

@@ -15,8 +15,7 @@ from torch import Tensor
 
 from gpu_day.context import Context
 from raytran.model import inputs_of
-from raytran.ops.tracer import RayTracer
-from raytran.ops.triton.dispatch import Attention
+from raytran.ops.tracer import Attention, RayTracer
 from raytran.run.plan.camera_paths import walk
 from raytran.run.train.build import build_model, build_module
 from raytran.structs import SceneBatch

@@ -27,7 +27,7 @@ SMALL = (
     "model.grid_resolution=[4,4,4]",
     "views.image_size=[32,48]",
     "model.backbone.channels=16",
-    "model.backbone.resnet.width=8",
+    "model.backbone.encoder.width=8",
     "model.heads.objects.hidden=16",
     "model.heads.shape.widths=[8,8,8,8]",
 )

@@ -10,23 +10,19 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, cast
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from raytran.backbone.chunked import run_in_chunks
-from raytran.backbone.lifting import LiftingBackbone
+from raytran.backbone.backbone import VoxelBackbone
 from raytran.errors import ConfigError, ShapeError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.heads.objects import ObjectHead
-from raytran.heads.slots import objects_of_slots
-from raytran.ops.pairs import PairList
-from raytran.ops.tracer import RayTracer
+from raytran.heads.objects import ObjectOutputs, objects_of_queries
+from raytran.ops.ray_attention import Pairs
+from raytran.ops.tracer import Attention, RayTracer
 from raytran.ops.traverse import count_views
-from raytran.ops.triton.block_pairs import BlockPairs
-from raytran.ops.triton.dispatch import Attention
 from raytran.structs import ObjectSet, RawScene, SceneBatch, ScenePrediction, Views
 
 TASKS = ("occupancy", "foreground", "objects")
@@ -40,7 +36,7 @@ def inputs_of(batch: SceneBatch) -> dict[str, Any]:
     return {
         "views": batch.views,
         "grid_center": batch.grid_center,
-        "known": batch.objects,
+        "true_objects": batch.objects,
         "new_cameras": None if batch.new_views is None else Cameras.of(batch.new_views),
     }
 
@@ -65,7 +61,7 @@ class RayTran(nn.Module):
     def __init__(
         self,
         *,
-        backbone: LiftingBackbone,
+        backbone: VoxelBackbone,
         heads: Mapping[str, nn.Module],
         grid_resolution: Sequence[int] = (48, 48, 16),
         grid_extent: Sequence[float] = (9.0, 9.0, 3.5),
@@ -94,7 +90,7 @@ class RayTran(nn.Module):
         grid_center: Tensor | None = None,
         views_at_once: int | None = None,
         new_cameras: Cameras | None = None,
-        known: Sequence[ObjectSet] | None = None,
+        true_objects: Sequence[ObjectSet] | None = None,
     ) -> RawScene:
         """Run the backbone once and the heads of ``tasks``.
 
@@ -105,7 +101,8 @@ class RayTran(nn.Module):
             views_at_once: views that pass through the network together, so that memory hardly grows with
                 their number; for prediction only. None: all of them.
             new_cameras: what ``view`` renders, of leading shape ``(B, V)``; no other task sees them.
-            known: true objects of the scenes, for ``RawScene.copies`` in training; no other task sees them.
+            true_objects: of the scenes, for object heads that learn from noisy copies of them in training; no
+                other prediction depends on them.
 
         Returns:
             Raw predictions, None for what was not asked for.
@@ -116,52 +113,48 @@ class RayTran(nn.Module):
             ShapeError: image sides are not divisible by the encoder's stride, or tensors do not have the
                 documented shapes.
         """
-        cameras = Cameras.of(views)
-        center = cameras.position.mean(dim=1) if grid_center is None else grid_center
+        center = Cameras.of(views).position.mean(dim=1) if grid_center is None else grid_center
         grid = VoxelGrid(self.grid_resolution, self.grid_extent, center)
-        voxels, pixels = self._lift(views.images, cameras, grid, "foreground" in tasks, views_at_once)
-        objects = proposals = copies = None
+        voxels, pixels = self._run_backbone(views, grid, "foreground" in tasks, views_at_once)
+        objects = ObjectOutputs(())
         if "objects" in tasks:
-            head = cast("ObjectHead", self.heads["objects"])
-            if known is not None and head.makes_copies:
-                objects, proposals, copies = head.forward_with_copies(voxels, grid, known)
-            else:
-                objects, proposals = head(voxels, grid)
+            objects = self.heads["objects"](voxels, grid, true_objects)
         return RawScene(
             grid_center=center,
             occupancy=self.heads["occupancy"](voxels) if "occupancy" in tasks else None,
-            foreground=None if pixels is None else self._foreground(pixels, views_at_once),
-            objects=objects,
-            proposals=proposals,
-            copies=copies,
+            foreground=None if pixels is None else self._foreground(pixels),
+            objects=objects.layers or None,
+            proposals=objects.proposals,
+            denoising=objects.denoising,
             new_views=self._render(voxels, grid, new_cameras) if "view" in tasks else None,
         )
 
-    def _lift(
-        self, images: Tensor, cameras: Cameras, grid: VoxelGrid, with_pixels: bool, views_at_once: int | None
-    ) -> tuple[Tensor, Tensor | None]:
-        """Run the backbone: voxel features, and pixel features if they are wanted."""
+    def _run_backbone(
+        self, views: Views, grid: VoxelGrid, with_pixels: bool, views_at_once: int | None
+    ) -> tuple[Tensor, list[Tensor] | None]:
+        """Return voxel features, and the pixel features of each chunk of views if they are wanted."""
+        chunks = _in_chunks(views, views_at_once)
+        cameras = [Cameras.of(chunk) for chunk in chunks]
+        pairs = [self.trace(of_chunk, grid) for of_chunk in cameras]
+        # Nothing but a prediction has several chunks, and they have no gradient.
+        with torch.set_grad_enabled(torch.is_grad_enabled() and len(chunks) == 1):
+            return self.backbone(
+                [chunk.images for chunk in chunks], cameras, grid, pairs, with_pixels=with_pixels
+            )
 
-        def trace(some: Cameras) -> PairList | BlockPairs:
-            stride = self.backbone.stride
-            size = (images.shape[-2] // stride, images.shape[-1] // stride)
-            return (self.backbone.tracer or self.ray_tracer)(some, grid, size, self.rays_per_cell)
-
-        if views_at_once is None or views_at_once >= images.shape[1]:
-            return self.backbone(images, cameras, grid, trace(cameras), with_pixels=with_pixels)
-        return run_in_chunks(
-            self.backbone,
-            images,
+    def trace(self, cameras: Cameras, grid: VoxelGrid) -> Pairs:
+        """Return the pairs that the backbone reads, for cameras of leading shape ``(B, N)``."""
+        height, width = cameras.image_size
+        return self.backbone.trace(
             cameras,
             grid,
-            trace,
-            views_at_once=views_at_once,
-            with_pixels=with_pixels,
+            (height // self.backbone.stride, width // self.backbone.stride),
+            ray_tracer=self.ray_tracer,
+            rays_per_cell=self.rays_per_cell,
         )
 
-    def _foreground(self, pixels: Tensor, views_at_once: int | None) -> Tensor:
-        some = pixels.split(views_at_once or pixels.shape[1], dim=1)
-        logits = [self.heads["foreground"](chunk) for chunk in some]
+    def _foreground(self, pixels: Sequence[Tensor]) -> Tensor:
+        logits = [self.heads["foreground"](chunk) for chunk in pixels]
         return logits[0] if len(logits) == 1 else torch.cat(logits, dim=1)
 
     def _render(self, voxels: Tensor, grid: VoxelGrid, cameras: Cameras | None) -> Tensor:
@@ -206,7 +199,7 @@ class RayTran(nn.Module):
         Args:
             views: posed images, batch dimension 1.
             scene_id: name to give the result.
-            score_threshold: slots with a lower score are left out.
+            score_threshold: objects with a lower score are left out.
             with_shapes: decode the objects' shapes.
             views_at_once: views that pass through the network together, None for all; the same result up to
                 rounding in less memory.
@@ -243,13 +236,13 @@ class RayTran(nn.Module):
             ConfigError: the network has no view head.
         """
         self.eval()
-        seen, count = Cameras.of(views), cameras.intrinsics.shape[1]
-        center = seen.position.mean(dim=1) if grid_center is None else grid_center[None]
+        center = Cameras.of(views).position.mean(dim=1) if grid_center is None else grid_center[None]
         grid = VoxelGrid(self.grid_resolution, self.grid_extent, center)
-        voxels, _ = self._lift(views.images, seen, grid, False, views_at_once)
+        voxels, _ = self._run_backbone(views, grid, False, views_at_once)
+        count = cameras.intrinsics.shape[1]
         for start in range(0, count, views_at_once or max(count, 1)):
-            some = cameras.select(slice(start, start + (views_at_once or count)))
-            yield self._render(voxels, grid, some)[0].float().sigmoid()
+            chunk = cameras.select(slice(start, start + (views_at_once or count)))
+            yield self._render(voxels, grid, chunk)[0].float().sigmoid()
 
     @torch.no_grad()
     def decode(
@@ -274,7 +267,7 @@ class RayTran(nn.Module):
         )
 
     def _count_views(self, views: Views, grid_center: Tensor) -> Tensor:
-        cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], views.image_size)
+        cameras = Cameras.of(views.scene())
         grid = VoxelGrid(self.grid_resolution, self.grid_extent, grid_center)
         stride = self.backbone.stride
         size = (views.image_size[0] // stride, views.image_size[1] // stride)
@@ -283,10 +276,24 @@ class RayTran(nn.Module):
     def _objects(self, raw: RawScene, scene: int, score_threshold: float, with_shapes: bool) -> ObjectSet:
         if raw.objects is None:
             return ObjectSet.empty().to(raw.grid_center.device)
-        objects, embedding = objects_of_slots(raw.objects[-1], scene, score_threshold=score_threshold)
+        objects, embedding = objects_of_queries(raw.objects[-1], scene, score_threshold=score_threshold)
         if not with_shapes or "shape" not in self.heads:
             return objects
         # What a forward pass under autocast left in 16 bits is decoded outside of it.
         embedding = embedding.to(next(self.heads["shape"].parameters()).dtype)
         chunks = [self.decode_shapes(chunk) for chunk in embedding.split(SHAPES_AT_ONCE)]
         return replace(objects, shape=torch.cat(chunks).float().sigmoid())
+
+
+def _in_chunks(views: Views, views_at_once: int | None) -> list[Views]:
+    """Return the views of each scene ``views_at_once`` at a time, all together for None.
+
+    Raises:
+        ConfigError: ``views_at_once`` is not positive.
+    """
+    if views_at_once is not None and views_at_once < 1:
+        raise ConfigError(f"views_at_once={views_at_once} must be a number above 0")
+    count = views.images.shape[1]
+    if views_at_once is None or views_at_once >= count:
+        return [views]
+    return [views.select(slice(start, start + views_at_once)) for start in range(0, count, views_at_once)]

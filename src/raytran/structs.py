@@ -119,6 +119,18 @@ class Views(TensorStruct):
         """``(H, W)`` of the images."""
         return self.images.shape[-2], self.images.shape[-1]
 
+    def select(self, frames: slice | Tensor) -> Views:
+        """Return some of the N views of each scene.
+
+        Args:
+            frames: which, a slice or an int64 or bool tensor over N.
+        """
+        return Views(self.images[:, frames], self.intrinsics[:, frames], self.world_from_camera[:, frames])
+
+    def scene(self, index: int = 0) -> Views:
+        """Return the views of one scene, without the leading dimension: images are ``(N, 3 or 4, H, W)``."""
+        return Views(self.images[index], self.intrinsics[index], self.world_from_camera[index])
+
     def colors(self) -> Tensor:
         """Return red, green and blue in [0, 1], ``(B, N, 3, H, W)`` in floating point."""
         rgb = self.images[:, :, :3]
@@ -253,7 +265,7 @@ class SceneBatch(TensorStruct):
 
 @dataclass(frozen=True)
 class RawObjects(TensorStruct):
-    """Output of one decoder layer for every query slot.
+    """Output of one decoder layer for every query.
 
     Attributes:
         class_logits: ``(B, Q, K + 1)``, padding last.
@@ -268,6 +280,11 @@ class RawObjects(TensorStruct):
     log_size: Tensor
     yaw_vector: Tensor
     embedding: Tensor
+
+    def in_float32(self) -> RawObjects:
+        """Return the predictions in float32, but for the embedding: it goes back into the network."""
+        exact = {f.name: getattr(self, f.name).float() for f in fields(self) if f.name != "embedding"}
+        return replace(self, **exact)
 
 
 @dataclass(frozen=True)
@@ -300,7 +317,7 @@ class RawScene(TensorStruct):
         objects: one ``RawObjects`` per decoder layer, last layer last.
         proposals: where the queries of ``objects`` come from; None if they are learned.
         new_views: ``(B, V, 3, H, W)`` logits of red, green and blue.
-        copies: as ``objects``, of noisy copies of the true ones; slot i is of object i modulo M.
+        denoising: as ``objects``, for noisy copies of the true ones; query i is a copy of object i modulo M.
     """
 
     grid_center: Tensor
@@ -309,7 +326,7 @@ class RawScene(TensorStruct):
     objects: tuple[RawObjects, ...] | None = None
     proposals: RawProposals | None = None
     new_views: Tensor | None = None
-    copies: tuple[RawObjects, ...] | None = None
+    denoising: tuple[RawObjects, ...] | None = None
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ def test_both_streams_read_the_blocks_input(generator: torch.Generator) -> None:
         torch.randn(1, 2, 2, 2, 8, generator=generator),
         torch.randn(1, 3, 4, 8, generator=generator),
     )
-    new_voxels, new_pixels = block(voxels, pixels, one_pair(5, 3))
+    new_voxels, (new_pixels,) = block(voxels, [pixels], [one_pair(5, 3)])
     voxel_stream, pixel_stream = block.voxel_stream, block.pixel_stream
     to_voxel = voxel_stream.output(voxel_stream.value(block.pixel_norm(pixels).view(-1, 8)[5]))
     to_pixel = pixel_stream.output(pixel_stream.value(block.voxel_norm(voxels).view(-1, 8)[3]))
@@ -45,17 +45,17 @@ def test_feed_forwards_reach_neighbours_of_their_own_space() -> None:
     none = PairList(torch.zeros(0, dtype=torch.long), torch.zeros(0, dtype=torch.long), 24, 125)
     moved = voxels.clone()
     moved[0, 2, 2, 2] += torch.tensor([1.0, -2.0, 3.0, 0.5])
-    before, after = block(voxels, pixels, none), block(moved, pixels, none)
+    before, after = block(voxels, [pixels], [none]), block(moved, [pixels], [none])
     changed = (before[0] - after[0]).abs().amax(-1)[0] > 0
     expected = torch.zeros(5, 5, 5, dtype=torch.bool)
     expected[1:4, 1:4, 1:4] = True
     assert torch.equal(changed, expected)
-    torch.testing.assert_close(before[1], after[1])
+    torch.testing.assert_close(before[1][0], after[1][0])
 
 
 def test_pixels_can_be_left_alone() -> None:
     block = RayTracedBlock(channels=4, num_heads=1)
     voxels, pixels = torch.randn(1, 2, 2, 2, 4), torch.randn(1, 3, 4, 4)
-    full, alone = (block(voxels, pixels, one_pair(0, 0), update_pixels=flag) for flag in (True, False))
+    full, alone = (block(voxels, [pixels], [one_pair(0, 0)], update_pixels=flag) for flag in (True, False))
     torch.testing.assert_close(full[0], alone[0])
-    assert alone[1] is pixels
+    assert alone[1][0] is pixels

@@ -6,7 +6,6 @@ import torch
 from torch import nn
 
 from raytran.backbone.backbone import Backbone
-from raytran.backbone.chunked import run_in_chunks
 from raytran.backbone.observed import observe_attention
 from raytran.backbone.resnet import ResNet18
 from raytran.errors import ShapeError
@@ -14,12 +13,14 @@ from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.ops.traverse import trace_pairs
 
+from ..factories import run_backbone
+
 
 @pytest.fixture
 def run(generator):
     """Run a small backbone on three views, all at once or two at a time."""
     torch.manual_seed(0)
-    backbone = Backbone(resnet=ResNet18(width=8), channels=8, num_heads=2, num_blocks=2).eval()
+    backbone = Backbone(encoder=ResNet18(width=8), channels=8, num_heads=2, num_blocks=2).eval()
     pose = torch.eye(4).repeat(1, 3, 1, 1)
     pose[..., :3, 3] = torch.rand(1, 3, 3, generator=generator)
     intrinsics = torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]).expand(1, 3, 3, 3)
@@ -30,9 +31,7 @@ def run(generator):
         def trace(some):
             return trace_pairs(some, grid, (2, 3))
 
-        if views_at_once is None:
-            return backbone(images, cameras, grid, trace(cameras))
-        return run_in_chunks(backbone, images, cameras, grid, trace, views_at_once=views_at_once)
+        return run_backbone(backbone, images, cameras, grid, trace, views_at_once=views_at_once)
 
     return backbone, go
 

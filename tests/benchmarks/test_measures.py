@@ -28,7 +28,7 @@ SMALL = [
     "model.grid_resolution=[4,4,4]",
     "views.image_size=[32,48]",
     "model.backbone.channels=16",
-    "model.backbone.resnet.width=8",
+    "model.backbone.encoder.width=8",
 ]
 
 
@@ -177,7 +177,7 @@ def test_a_steps_peak_is_taken_from_before_there_is_a_network(monkeypatch):
         return build_model(*arguments, **options)
 
     monkeypatch.setattr(fit, "build_model", build)
-    cfg = step_config("tiny", "stage2", Device(), [*SMALL, "model.backbone.resnet.width=64"])
+    cfg = step_config("tiny", "stage2", Device(), [*SMALL, "model.backbone.encoder.width=64"])
     steps = run_steps(cfg, walk(2).scaled_to((32, 48)), Noting(), timed=3, warm_up=1)
     assert order == ["held", "peak", "build", "peak"]  # on a CPU what is held is the peak until now
     assert len(steps.losses) == 1 + 1 + 3 + 1

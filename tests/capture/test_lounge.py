@@ -26,7 +26,7 @@ Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 def network():
     """An untrained network that is the same each time, with queries that keep their order."""
     torch.manual_seed(0)
-    small = ["preset=tiny", "model.grid_resolution=[8,8,4]", "model.heads.objects.queries=learned"]
+    small = ["preset=tiny", "model.grid_resolution=[8,8,4]", "model.heads.objects.queries=null"]
     return build_model(compose("train", [*small, "output_dir=x"])).eval()
 
 

@@ -43,13 +43,13 @@ def test_load_rebuilds_the_model(saved):
 
 def test_the_card_is_complete(saved):
     content = torch.load(saved[0], weights_only=True)
-    assert content["format"] == "raytran.checkpoint/1"
+    assert content["format"] == "raytran.checkpoint/2"
     assert (content["stage"], content["preset"], content["parent"]["path"]) == (
         "joint",
         "tiny",
         "stage1.ckpt",
     )
-    assert content["model"]["_target_"] == "raytran.model.RayTran"
+    assert content["model"]["_target_"] == "RayTran"
     assert content["versions"]["torch"] == torch.__version__
     assert content["git_commit"] is None or len(content["git_commit"].split("+")[0]) == 40
 
@@ -134,7 +134,7 @@ def test_a_head_of_another_form_starts_at_random_if_that_of_the_parent_is_random
         [
             "preset=tiny",
             "model.grid_resolution=[8,8,4]",
-            "model.heads.objects.queries=learned",
+            "model.heads.objects.queries=null",
             "output_dir=unused",
         ],
     )

@@ -41,7 +41,7 @@ def flip_bit(path):
 
 def test_what_is_written_is_read_without_trust(path):
     assert torch.equal(read_checkpoint(path)["state_dict"]["weight"], torch.arange(1000.0))
-    assert torch.load(path, weights_only=True)["format"] == "raytran.checkpoint/1"
+    assert torch.load(path, weights_only=True)["format"] == "raytran.checkpoint/2"
     assert [file.name for file in path.parent.iterdir()] == ["last.ckpt"]
 
 
@@ -69,8 +69,8 @@ def test_a_missing_file_is_one_sentence(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"format": None}, r"expected format raytran\.checkpoint/1, got None"),
-        ({"format": "raytran.checkpoint/2"}, r"newer raytran \(format raytran\.checkpoint/2.*update raytran"),
+        ({"format": None}, r"expected format raytran\.checkpoint/2, got None"),
+        ({"format": "raytran.checkpoint/3"}, r"newer raytran \(format raytran\.checkpoint/3.*update raytran"),
         ({"model": "RayTran"}, r"no proper 'model'"),
         ({"state_dict": {"weight": 1.0}}, r"weights are no tensors"),
     ],

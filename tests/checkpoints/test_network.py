@@ -4,11 +4,19 @@
 from __future__ import annotations
 
 import copy
+import importlib
+import json
 import sys
 
 import pytest
 
-from raytran.checkpoints.network import build_network, own_packages
+from raytran.checkpoints.network import (
+    PARTS,
+    build_network,
+    own_packages,
+    with_import_paths,
+    with_registered_names,
+)
 from raytran.errors import CheckpointError, ConfigError
 from raytran.model import RayTran
 from raytran.run.entry import compose
@@ -17,7 +25,7 @@ from raytran.run.train.build import plain
 
 @pytest.fixture(scope="module")
 def config():
-    return plain(compose("train", ["preset=tiny", "output_dir=unused"]).model)
+    return with_registered_names(plain(compose("train", ["preset=tiny", "output_dir=unused"]).model))
 
 
 def changed(config, path, value):
@@ -71,14 +79,15 @@ def test_a_stranger_is_not_even_imported(config, marked, place):
         "raytran.backbone..resnet.ResNet18",
         "raytran.model",
         "raytran.heads.os.system",
-        "RayTran",
+        "raytran.model.RayTran",  # ours, but not by its registered name
+        "Linear",
         "",
         None,
         7,
     ],
 )
 def test_only_networks_of_raytran_are_built(config, target):
-    for place in ("_target_", "backbone.resnet._target_"):
+    for place in ("_target_", "backbone.encoder._target_"):
         with pytest.raises(CheckpointError, match="which is no network of raytran"):
             build_network(changed(config, place, target), "a.ckpt")
 
@@ -87,7 +96,7 @@ def test_only_networks_of_raytran_are_built(config, target):
     ("place", "value"),
     [
         ("_args_", [["true"]]),
-        ("backbone._partial_", True),
+        ("backbone._partial_", True),  # then there is no backbone
         ("backbone._recursive_", False),
         ("heads.__class__", "x"),
         ("backbone.channels", print),
@@ -109,7 +118,7 @@ def test_references_are_text(config):
 def test_nothing_is_read_or_fetched(config, weights, monkeypatch):
     monkeypatch.setattr("torch.hub.load_state_dict_from_url", lambda *_, **__: pytest.fail("fetched"))
     monkeypatch.setattr("torch.load", lambda *_, **__: pytest.fail("read"))
-    assert isinstance(build_network(changed(config, "backbone.resnet.weights", weights), "a.ckpt"), RayTran)
+    assert isinstance(build_network(changed(config, "backbone.encoder.weights", weights), "a.ckpt"), RayTran)
 
 
 @pytest.mark.parametrize(("place", "value"), [("backbone.depth", 3), ("backbone.channels", -4), ("heads", 5)])
@@ -186,3 +195,24 @@ def test_packages_that_a_network_names(config):
     assert own_packages(config) == ()
     own = changed(changed(config, "backbone._target_", "b.nets.Net"), "heads.extra", [{"_target_": "a.Head"}])
     assert own_packages(own) == ("a", "b")
+
+
+def test_every_registered_part_is_where_it_is_said_to_be():
+    for name, module in PARTS.items():
+        assert getattr(importlib.import_module(module), name).__module__ == module, name
+
+
+@pytest.mark.parametrize("preset", ["raytran", "small", "laptop", "tiny"])
+def test_names_stand_for_import_paths(preset):
+    settings = plain(
+        compose("train", [f"preset={preset}", "experiment=novel_view", "output_dir=unused"]).model
+    )
+    named = with_registered_names(settings)
+    assert "raytran." not in json.dumps(named)
+    assert with_import_paths(named) == settings
+
+
+def test_a_part_without_a_name_is_told_when_training_starts():
+    with pytest.raises(ConfigError, match=r"raytran\.heads\.new\.NewHead is not registered.*a line in PARTS"):
+        with_registered_names({"_target_": "raytran.heads.new.NewHead"})
+    assert with_registered_names({"_target_": "mylab.NewHead"}) == {"_target_": "mylab.NewHead"}

@@ -110,7 +110,7 @@ def test_a_strangers_file_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"format": "raytran.checkpoint/2"}, "newer raytran"),
+        ({"format": "raytran.checkpoint/3"}, "newer raytran"),
         ({"format": "someone/1"}, "expected format"),
         ({"model": "RayTran"}, "no proper 'model'"),
         ({"views": None}, "no proper 'views'"),

@@ -158,7 +158,7 @@ def no_network(monkeypatch):
     monkeypatch.setattr(raytran.backbone.resnet, "_fetch_imagenet", fetch)
 
 
-FULL_WIDTH = ["model.backbone.resnet.width=64", "model.backbone.resnet.weights=auto"]
+FULL_WIDTH = ["model.backbone.encoder.width=64", "model.backbone.encoder.weights=auto"]
 
 
 def test_a_random_start_of_the_encoder_is_said_in_capitals(settings, no_network, tmp_path, caplog, capsys):

@@ -212,7 +212,7 @@ def test_one_stage_1_does_for_another_object_head(settings, trained, tmp_path, c
     other = [
         "experiment=stage2",
         f"init_from={trained[1][0].checkpoint}",
-        "model.heads.objects.queries=learned",
+        "model.heads.objects.queries=null",
     ]
     with caplog.at_level("INFO", "raytran"):
         child = fit(settings, tmp_path / "run", *other)

@@ -110,7 +110,7 @@ def test_it_runs_without_raytran(model, file, tmp_path):
 
 def test_with_raytrans_operators_it_gives_the_same_bits():
     """Also for proposed queries, whose order rounding may change, and for some of the heads alone."""
-    model = network("model.heads.objects.queries=proposal")
+    model = network("model/extensions=[proposal_queries]")
     program = export_network(model, cameras(3), tasks=["objects"], operators="raytran").module()
     inputs = example_inputs(model, cameras(2))
     with torch.no_grad():

@@ -1,18 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 import torch
 
-from raytran.errors import ConfigError
+from raytran.extensions.box_refinement import BoxRefinement
+from raytran.extensions.windowed_attention import WindowedAttention
 from raytran.geometry.grid import VoxelGrid
-from raytran.heads.objects import ObjectHead
+from raytran.heads.decoder import VoxelAttention
+from raytran.heads.objects import CenterRefinement, ObjectHead
 from raytran.structs import RawObjects
 
 EXTENT = (4.0, 4.0, 2.0)
 
 
-def small_head(**changes: int | str) -> ObjectHead:
+def small_head(**changes: Any) -> ObjectHead:
     torch.manual_seed(0)
     sizes = {
         "channels": 24,
@@ -20,7 +24,7 @@ def small_head(**changes: int | str) -> ObjectHead:
         "num_layers": 2,
         "num_queries": 6,
         "hidden": 24,
-        "windowed": True,
+        "voxel_attention": WindowedAttention,
         **changes,
     }
     return ObjectHead(**sizes, grid_extent=EXTENT)
@@ -32,11 +36,11 @@ def grid_at(*centers: list[float]) -> VoxelGrid:
 
 def last(head: ObjectHead, voxels: torch.Tensor, grid: VoxelGrid) -> RawObjects:
     """What the last layer predicts."""
-    return head(voxels, grid)[0][-1]
+    return head(voxels, grid).layers[-1]
 
 
 def test_shapes_of_every_layer() -> None:
-    outputs, proposals = small_head()(torch.randn(2, 4, 4, 2, 24), grid_at([0.0, 0, 0], [1.0, 2, 3]))
+    outputs, proposals, _ = small_head()(torch.randn(2, 4, 4, 2, 24), grid_at([0.0, 0, 0], [1.0, 2, 3]))
     assert len(outputs) == 2
     assert proposals is None
     for objects in outputs:
@@ -46,11 +50,11 @@ def test_shapes_of_every_layer() -> None:
         assert objects.embedding.shape == (2, 6, 24)
 
 
-@pytest.mark.parametrize("refines", ["center", "box"])
-@pytest.mark.parametrize("windowed", [False, True])
-def test_later_layers_teach_earlier_ones_where_to_look(refines, windowed) -> None:
+@pytest.mark.parametrize("refinement", [CenterRefinement(), BoxRefinement()])
+@pytest.mark.parametrize("attention", [VoxelAttention, WindowedAttention])
+def test_later_layers_teach_earlier_ones_where_to_look(refinement, attention) -> None:
     """Reference points are refined with gradients: the last centre's reaches the first layer's offset."""
-    head = small_head(refines=refines, windowed=windowed, num_layers=3)
+    head = small_head(refinement=refinement, voxel_attention=attention, num_layers=3)
     last(head, torch.randn(1, 4, 4, 2, 24), grid_at([0.0, 0, 0])).center.sum().backward()
     for predictor in head.predictors:
         # Offsets add up: a layer's bias moves all six queries' last centres along with its own.
@@ -77,7 +81,7 @@ def test_untrained_objects_lie_in_the_volume_with_common_sizes() -> None:
 
 def test_every_parameter_gets_a_gradient() -> None:
     head = small_head()
-    outputs, _ = head(torch.randn(1, 4, 4, 2, 24), grid_at([0.0, 0, 0]))
+    outputs = head(torch.randn(1, 4, 4, 2, 24), grid_at([0.0, 0, 0])).layers
     fields = ("class_logits", "center", "log_size", "yaw_vector")
     sum(getattr(objects, name).square().sum() for objects in outputs for name in fields).backward()
     assert [name for name, p in head.named_parameters() if p.grad is None or not p.grad.any()] == []
@@ -93,36 +97,26 @@ def test_half_precision_keeps_centers_exact() -> None:
     assert float((half.center - exact.center).detach().abs().max()) < 0.02
 
 
-def test_unknown_queries() -> None:
-    with pytest.raises(ConfigError, match="learned or proposal"):
-        small_head(queries="random")
-
-
-@pytest.mark.parametrize("refines", ["center", "box"])
-def test_layers_predict_the_change_of_what_is_refined(refines: str) -> None:
+@pytest.mark.parametrize("refinement", [CenterRefinement(), BoxRefinement()])
+def test_layers_predict_the_change_of_what_is_refined(refinement) -> None:
     """The last layers of all predictors are set to a constant: what adds up grows from layer to layer."""
-    head = small_head(num_layers=3, refines=refines)
+    head = small_head(num_layers=3, refinement=refinement)
     with torch.no_grad():
         for predictor in head.predictors:
             for network in (predictor.offset, predictor.log_size, predictor.yaw):
                 network[-1].weight.zero_()
                 network[-1].bias.fill_(0.1)
-    first, _, third = head(torch.randn(1, 4, 4, 2, 24), grid_at([0.0, 0, 0]))[0]
+    first, _, third = head(torch.randn(1, 4, 4, 2, 24), grid_at([0.0, 0, 0])).layers
     torch.testing.assert_close(third.center - first.center, torch.full((1, 6, 3), 0.2))
-    grown = 0.2 if refines == "box" else 0.0
+    grown = 0.2 if isinstance(refinement, BoxRefinement) else 0.0
     torch.testing.assert_close(third.log_size - first.log_size, torch.full((1, 6, 3), grown))
     torch.testing.assert_close(third.yaw_vector - first.yaw_vector, torch.full((1, 6, 2), grown))
 
 
 def test_refined_boxes_pass_gradients_to_early_layers() -> None:
     reached = []
-    for refines in ("center", "box"):
-        head = small_head(refines=refines)
+    for refinement in (CenterRefinement(), BoxRefinement()):
+        head = small_head(refinement=refinement)
         last(head, torch.randn(1, 4, 4, 2, 24), grid_at([0.0, 0, 0])).log_size.sum().backward()
         reached.append(head.predictors[0].log_size[-1].bias.grad is not None)
     assert reached == [False, True]
-
-
-def test_an_unknown_refinement_is_refused() -> None:
-    with pytest.raises(ConfigError, match="choose center or box"):
-        small_head(refines="all")

@@ -46,7 +46,7 @@ def test_images_have_the_cameras_size(widths: tuple[int, ...], stride: int) -> N
 
 
 def test_full_resolution_holds_three_channels() -> None:
-    assert make_head().grow[-1].out_channels == 3
+    assert make_head().upsampler[-1].out_channels == 3
 
 
 def test_a_camera_sees_the_voxels_on_its_rays_and_no_others() -> None:

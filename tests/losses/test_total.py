@@ -9,6 +9,9 @@ import pytest
 import torch
 
 from raytran.errors import ConfigError, DataError
+from raytran.extensions.denoising import DenoisingLoss
+from raytran.extensions.proposal_queries import ProposalLoss, ProposalQueries
+from raytran.extensions.windowed_attention import WindowedAttention
 from raytran.geometry.grid import VoxelGrid
 from raytran.heads.objects import ObjectHead
 from raytran.losses.matcher import HungarianMatcher
@@ -192,6 +195,15 @@ def test_all_layers_may_tell_shapes(make_objects, make_perfect, terms) -> None:
         losses(shape_layers="first")
 
 
+def losses_of_all(**settings: float) -> TotalLoss:
+    return TotalLoss(
+        weights=WEIGHTS,
+        matcher=HungarianMatcher(weights=WEIGHTS),
+        extensions={"proposals": ProposalLoss(), "denoising": DenoisingLoss()},
+        **settings,
+    )
+
+
 def test_betas_count_in_every_term_of_poses(make_objects, make_perfect) -> None:
     """Decoder layers, proposals and noisy copies, each 0.4 m off along one axis."""
     objects = make_objects(1)
@@ -211,11 +223,11 @@ def test_betas_count_in_every_term_of_poses(make_objects, make_perfect) -> None:
     )
     copy = make_perfect(objects, torch.tensor([0]), 1)
     copy = replace(copy, center=copy.center + shift)
-    scene = RawScene(torch.zeros(1, 3), objects=(raw, raw), proposals=proposals, copies=(copy,))
+    scene = RawScene(torch.zeros(1, 3), objects=(raw, raw), proposals=proposals, denoising=(copy,))
     for beta, expected in ((0.1, 0.35), (0.8, 0.1), (0.0, 0.4)):
-        loss = TotalLoss(weights=WEIGHTS, matcher=HungarianMatcher(weights=WEIGHTS), center_beta=beta)
+        loss = losses_of_all(center_beta=beta)
         losses = loss(scene, batch(objects), terms=("objects",))
-        for place in ("", "/layer0", "/proposals", "/copies"):
+        for place in ("", "/layer0", "/proposals", "/denoising"):
             assert float(losses[f"objects/center{place}"].detach()) == pytest.approx(expected, rel=1e-4), (
                 place
             )
@@ -255,19 +267,19 @@ def test_a_small_decoder_overfits_two_scenes(make_objects, queries) -> None:
         num_heads=2,
         num_layers=2,
         num_queries=8,
-        queries=queries,
+        queries=ProposalQueries if queries == "proposal" else None,
         hidden=48,
-        windowed=True,
+        voxel_attention=WindowedAttention,
         grid_extent=(5.0, 5.0, 5.0),
     )
     voxels = torch.randn(2, 4, 4, 4, 24)
     grid = VoxelGrid((4, 4, 4), (5.0, 5.0, 5.0), torch.zeros(2, 3))
     targets = batch(make_objects(3, 1), make_objects(2, 2))
-    loss = total_loss()
+    loss = losses_of_all()
     optimizer = torch.optim.AdamW(head.parameters(), lr=3e-3)
     history = []
     for _ in range(150):
-        objects, proposals = head(voxels, grid)
+        objects, proposals, _ = head(voxels, grid)
         raw = RawScene(grid.center, objects=objects, proposals=proposals)
         losses = loss(raw, targets, terms=("objects",))
         optimizer.zero_grad()

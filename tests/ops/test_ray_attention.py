@@ -7,7 +7,8 @@ from torch import Tensor
 from torch._dynamo.testing import CompileCounterWithBackend
 
 from raytran.errors import ShapeError
-from raytran.ops import pair_attention, reference
+from raytran.ops import reference
+from raytran.ops import sparse as pair_attention
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_attention import ray_attention, ray_attention_with_sum
 from raytran.ops.triton import dispatch as fused

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from raytran.ops.reference import pair_mask
-from raytran.ops.segment import row_of_pair, sampled_product, segment_max, segment_sum, sparse_product
+from raytran.ops.sparse import row_of_pair, sampled_product, segment_max, segment_sum, sparse_product
 
 
 @pytest.mark.parametrize("side", ["pixels", "voxels"])

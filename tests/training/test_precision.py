@@ -45,7 +45,7 @@ def test_sixteen_bits_train_like_thirty_two(experiment, batch, make_module):
 
     With learned queries: which voxels are proposed hangs on rounding as long as nothing is learned.
     """
-    learned = "model.heads.objects.queries=learned"
+    learned = "model.heads.objects.queries=null"
     exact, exact_scores = history(make_module(experiment, learned), batch, "32-true")
     short, short_scores = history(make_module(experiment, learned), batch, "bf16-mixed")
     fall = exact[0] - exact[-1]

@@ -44,7 +44,7 @@ SETTINGS = [
     "preset=tiny",
     "model.grid_resolution=[8,8,4]",
     "model.heads.objects.num_queries=6",
-    "model.heads.objects.windowed=false",  # computes in float32, whatever it is given
+    "model.heads.objects.voxel_attention=null",  # computes in float32, whatever it is given
     "output_dir=unused",
 ]
 

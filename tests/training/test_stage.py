@@ -62,9 +62,9 @@ def test_a_step_reaches_what_the_stage_trains_and_nothing_else(experiment, batch
 @pytest.mark.parametrize(
     ("settings", "trained"),
     [
-        (["model=unprojection"], ("backbone.", "heads.view.")),
+        (["model/backbone=unprojection"], ("backbone.", "heads.view.")),
         (
-            ["model.backbone.resnet.stride=8", "model.heads.foreground.widths=[32,16]"],
+            ["model.backbone.encoder.stride=8", "model.heads.foreground.widths=[32,16]"],
             ("backbone.", "heads.view."),
         ),
         (["stage.trainable=[heads.view]"], ("heads.view.",)),

@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from typing import Literal
 
 from torch import Tensor, nn
 
-from raytran.ops.pairs import PairList
-from raytran.ops.ray_attention import Direction, ray_attention
-from raytran.ops.triton.block_pairs import BlockPairs
+from raytran.ops.ray_attention import Direction, Pairs, ray_attention_in_chunks
 
 
 class RayTracedBlock(nn.Module):
@@ -17,6 +16,9 @@ class RayTracedBlock(nn.Module):
 
     The two streams are parallel: both read the features that enter the block. Layer normalisation comes
     before attention and feed-forward, whose results are added to the stream.
+
+    A view's pixels attend to voxels alone, so they need no other view, and chunks of views change nothing for
+    them. A voxel attends to the pixels of all views: its softmax is joined from those over each chunk.
 
     Args:
         channels: C of both streams.
@@ -36,24 +38,32 @@ class RayTracedBlock(nn.Module):
         )
 
     def forward(
-        self, voxels: Tensor, pixels: Tensor, pairs: PairList | BlockPairs, *, update_pixels: bool = True
-    ) -> tuple[Tensor, Tensor]:
+        self, voxels: Tensor, pixels: Sequence[Tensor], pairs: Sequence[Pairs], *, update_pixels: bool = True
+    ) -> tuple[Tensor, list[Tensor]]:
         """Return the two representations after the block.
 
         Args:
             voxels: ``(B, X, Y, Z, C)``.
-            pixels: ``(n, h, w, C)`` with n = B · N.
-            pairs: the pixel-voxel pairs of all scenes.
+            pixels: of each chunk of views ``(n, h, w, C)`` with n = B · N.
+            pairs: of each chunk, the pixel-voxel pairs of all scenes.
             update_pixels: False returns ``pixels`` unchanged (the last block, where nothing reads them).
 
         Returns:
-            voxels ``(B, X, Y, Z, C)`` and pixels ``(n, h, w, C)``.
+            voxels ``(B, X, Y, Z, C)`` and the pixels ``(n, h, w, C)`` of each chunk.
         """
-        voxel_input, pixel_input = self.voxel_norm(voxels), self.pixel_norm(pixels)
-        new_voxels = self.voxel_stream(voxels, voxel_input, pixel_input, pairs)
-        if update_pixels:
-            pixels = self.pixel_stream(pixels, pixel_input, voxel_input, pairs)
-        return new_voxels, pixels
+        voxel_input = self.voxel_norm(voxels)
+        pixel_inputs = [self.pixel_norm(features) for features in pixels]
+        # Keys and values of a chunk are made when they are read: those of one chunk are in memory at a time.
+        keys_and_values = (self.voxel_stream.keys_and_values(source) for source in pixel_inputs)
+        new_voxels = self.voxel_stream(voxels, voxel_input, keys_and_values, pairs)
+        if not update_pixels:
+            return new_voxels, list(pixels)
+        of_voxels = self.pixel_stream.keys_and_values(voxel_input)
+        new_pixels = [
+            self.pixel_stream(features, target, [of_voxels], [of_chunk])
+            for features, target, of_chunk in zip(pixels, pixel_inputs, pairs, strict=True)
+        ]
+        return new_voxels, new_pixels
 
 
 class Stream(nn.Module):
@@ -80,31 +90,34 @@ class Stream(nn.Module):
             channels=channels, hidden=expansion * channels, dimensions=dimensions
         )
 
-    def forward(self, stream: Tensor, target: Tensor, source: Tensor, pairs: PairList | BlockPairs) -> Tensor:
+    def forward(
+        self,
+        stream: Tensor,
+        target: Tensor,
+        keys_and_values: Iterable[tuple[Tensor, Tensor]],
+        pairs: Sequence[Pairs],
+    ) -> Tensor:
         """Return the stream after attention and feed-forward.
 
         Args:
             stream: ``(n, ..., C)`` un-normalised target features, to which results are added.
             target: ``(n, ..., C)`` the same, normalised: the queries.
-            source: ``(m, ..., C)`` normalised features of the other representation: keys and values.
-            pairs: the pixel-voxel pairs.
+            keys_and_values: of each chunk of the sources, see ``keys_and_values``.
+            pairs: of each chunk, the pixel-voxel pairs.
 
         Returns:
             ``(n, ..., C)``.
         """
-        query, (key, value) = self.heads(self.query(target)), self.keys_and_values(source)
-        return self.finish(stream, ray_attention(query, key, value, pairs, direction=self.direction))
-
-    def keys_and_values(self, source: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what sources ``(m, ..., C)`` are scored by and what they contribute, ``(S, H, D)`` each."""
-        return self.heads(self.key(source)), self.heads(self.value(source))
-
-    def finish(self, stream: Tensor, attended: Tensor) -> Tensor:
-        """Add what was attended to, ``(T, H, D)``, to the stream ``(n, ..., C)``, then the feed-forward."""
+        query = self._split_heads(self.query(target))
+        attended = ray_attention_in_chunks(query, keys_and_values, pairs, direction=self.direction)
         stream = stream + self.output(attended.flatten(1)).view(stream.shape)
         return stream + self.feed_forward(self.norm(stream))
 
-    def heads(self, x: Tensor) -> Tensor:
+    def keys_and_values(self, source: Tensor) -> tuple[Tensor, Tensor]:
+        """Return keys and values ``(S, H, D)`` of normalised source features ``(m, ..., C)``."""
+        return self._split_heads(self.key(source)), self._split_heads(self.value(source))
+
+    def _split_heads(self, x: Tensor) -> Tensor:
         """Map ``(n, ..., C)`` to ``(T, H, D)``."""
         return x.reshape(-1, self.num_heads, x.shape[-1] // self.num_heads)
 

@@ -8,9 +8,10 @@ from urllib.error import URLError
 
 import torch
 from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
 
 from raytran.backbone.encoder_weights import imagenet_or_random, load_state, read_state
-from raytran.backbone.norms import set_momentum
+from raytran.backbone.image_features import ImageEncoder
 from raytran.errors import CheckpointError, ConfigError
 
 IMAGENET_URL = "https://download.pytorch.org/models/resnet18-f37072fd.pth"
@@ -45,7 +46,7 @@ class BasicBlock(nn.Module):
         return torch.relu_(out + (x if self.downsample is None else self.downsample(x)))
 
 
-class ResNet18(nn.Module):
+class ResNet18(ImageEncoder):
     """The trunk of ResNet-18 without its classifier.
 
     The last stage keeps its resolution, so the output has stride 16: 640×480 gives the paper's 40×30.
@@ -74,7 +75,6 @@ class ResNet18(nn.Module):
 
     image_mean = (0.485, 0.456, 0.406)
     image_std = (0.229, 0.224, 0.225)
-    frozen = False
 
     def __init__(
         self,
@@ -104,7 +104,7 @@ class ResNet18(nn.Module):
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
-        set_momentum(self, norm_momentum)
+        set_norm_momentum(self, norm_momentum)
         if weights is not None:
             if width != 64:
                 raise ConfigError(
@@ -148,3 +148,13 @@ def _fetch_imagenet() -> dict[str, Tensor]:
             f"could not fetch the ImageNet weights ({error}): download {IMAGENET_URL} and put it at "
             f"{folder / name}, or set weights to its path, or weights=null for a random start"
         ) from error
+
+
+def set_norm_momentum(network: nn.Module, momentum: float) -> None:
+    """Set the share of each batch in the running statistics of all batch norms of ``network``.
+
+    With few scenes a step a batch is the views of one or two scenes, and its statistics are poor.
+    """
+    for module in network.modules():
+        if isinstance(module, _BatchNorm):
+            module.momentum = momentum

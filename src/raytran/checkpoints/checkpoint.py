@@ -17,8 +17,7 @@ from raytran.checkpoints.known_data import KnownData
 from raytran.checkpoints.weights import checkpoint_path
 from raytran.checkpoints.weights_file import PREFIX
 from raytran.errors import CheckpointError
-from raytran.ops.tracer import RayTracer
-from raytran.ops.triton.dispatch import Attention
+from raytran.ops.tracer import Attention, RayTracer
 
 if TYPE_CHECKING:
     from raytran.model import RayTran
@@ -42,13 +41,14 @@ def checkpoint_card(
         parent: the checkpoint that the fit started from, see ``Parent``, or None.
         warnings: what anybody who uses the weights should know.
     """
+    from raytran.checkpoints.network import with_registered_names
     from raytran.checkpoints.provenance import git_commit, versions
 
     return {
         "format": FORMAT,
         "stage": stage,
         "preset": preset,
-        "model": copy.deepcopy(config["model"]),
+        "model": with_registered_names(config["model"]),
         "views": copy.deepcopy(config["views"]),
         "config": copy.deepcopy(dict(config)),
         "data": KnownData.of_config(config).as_plain(),

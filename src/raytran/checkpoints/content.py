@@ -10,7 +10,8 @@ from torch import Tensor
 
 from raytran.errors import CheckpointError
 
-FORMAT = "raytran.checkpoint/1"
+FORMAT = "raytran.checkpoint/2"
+EARLIER_FORMAT = "raytran.checkpoint/1"
 
 _REQUIRED = {"stage": str, "preset": str, "model": dict, "views": dict, "state_dict": dict}
 
@@ -20,7 +21,7 @@ class DamagedCheckpointError(CheckpointError):
 
 
 def check_content(content: Any, path: Path) -> None:
-    """Raise unless ``content`` is what this version of raytran writes.
+    """Raise unless ``content`` is what this version of raytran reads.
 
     Raises:
         CheckpointError: it is of a newer version, of another program, or not all there.
@@ -34,7 +35,7 @@ def check_content(content: Any, path: Path) -> None:
                 f"{path} was written by a newer raytran (format {found}, this one reads {FORMAT}): "
                 "update raytran"
             )
-    if found != FORMAT:
+    if found not in (FORMAT, EARLIER_FORMAT):
         raise CheckpointError(f"{path} is no checkpoint of raytran: expected format {FORMAT}, got {found}")
     for name, kind in _REQUIRED.items():
         if not isinstance(content.get(name), kind):

@@ -13,7 +13,8 @@ from typing import Any
 
 import torch
 
-from raytran.checkpoints.content import DamagedCheckpointError, check_content
+from raytran.checkpoints.content import EARLIER_FORMAT, FORMAT, DamagedCheckpointError, check_content
+from raytran.checkpoints.earlier import upgraded
 from raytran.checkpoints.weights_file import is_weights_file, read_weights
 from raytran.errors import CheckpointError
 
@@ -94,8 +95,13 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
             f"{path} is a program of torch.export, which holds no settings to build a network by: give the "
             ".ckpt or .safetensors file that it was made from"
         )
-    if is_weights_file(path):
-        return read_weights(path)
+    content = read_weights(path) if is_weights_file(path) else _read_torch_file(path)
+    if content["format"] == EARLIER_FORMAT:
+        return upgraded(content) | {"format": FORMAT}
+    return content
+
+
+def _read_torch_file(path: Path) -> dict[str, Any]:
     _check_bytes(path)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)

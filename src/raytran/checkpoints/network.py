@@ -1,24 +1,47 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Networks from the config inside a checkpoint, which may come from anybody."""
+"""Networks from the description inside a checkpoint, which may come from anybody.
+
+A checkpoint names the parts of its network by the names of ``PARTS``, not by where their classes stand: the
+folders of this package are no file format.
+"""
 
 from __future__ import annotations
 
+import functools
 import importlib
-import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
 from torch import nn
 
 from raytran.errors import CheckpointError, ConfigError
 
+PARTS: dict[str, str] = {
+    "RayTran": "raytran.model",
+    "Backbone": "raytran.backbone.backbone",
+    "Stream": "raytran.backbone.block",
+    "ResNet18": "raytran.backbone.resnet",
+    "OccupancyHead": "raytran.heads.dense",
+    "ForegroundHead": "raytran.heads.dense",
+    "ObjectHead": "raytran.heads.objects",
+    "CenterRefinement": "raytran.heads.objects",
+    "VoxelAttention": "raytran.heads.decoder",
+    "ShapeHead": "raytran.heads.shape",
+    "ViewHead": "raytran.heads.view",
+    "BoxRefinement": "raytran.extensions.box_refinement",
+    "DenoisingObjectHead": "raytran.extensions.denoising",
+    "EfficientNetLite0": "raytran.extensions.efficientnet",
+    "ProposalQueries": "raytran.extensions.proposal_queries",
+    "VoxelEncoderDecoder": "raytran.extensions.unet3d",
+    "UnprojectionBackbone": "raytran.extensions.unprojection",
+    "WindowedAttention": "raytran.extensions.windowed_attention",
+}
+"""Every class that a network of ours is built of, and the module it is in. A new part gets a line here."""
+
 _PACKAGE = "raytran"
 
-_MODULE = re.compile(r"raytran\.(model|backbone|heads)(\.[a-z_]+)*")
-"""Where the parts of a network are defined."""
-
-_NOT_THE_NETWORK = ("attention", "freeze_norms")
-"""Settings of ours that are not the network's: how it was computed there, and how older ones were trained."""
+_NOT_THE_NETWORK = ("attention",)
+"""Settings of ours that are not the network's: how it was computed there."""
 
 _PLAIN = (str, int, float, bool, type(None))
 
@@ -41,7 +64,9 @@ def trusted_packages(trust: Any) -> tuple[str, ...]:
 
 def own_packages(config: Any) -> tuple[str, ...]:
     """Return the top-level packages other than raytran whose classes ``config`` names, sorted."""
-    return tuple(sorted({str(target).partition(".")[0] for target in _targets(config)} - {_PACKAGE}))
+    targets = [str(target) for target in _targets(config)]
+    packages = {target.partition(".")[0] for target in targets if target not in PARTS}
+    return tuple(sorted(packages - {_PACKAGE}))
 
 
 def _targets(node: Any) -> Iterator[Any]:
@@ -55,12 +80,47 @@ def _targets(node: Any) -> Iterator[Any]:
         yield from _targets(value)
 
 
+def with_registered_names(config: Any) -> Any:
+    """Return the config of a network with the names of ``PARTS`` in place of import paths.
+
+    Raises:
+        ConfigError: a class of raytran has no name there.
+    """
+
+    def named(target: str) -> str:
+        module, _, name = target.rpartition(".")
+        if PARTS.get(name) == module or target in PARTS:
+            return name or target
+        if module.partition(".")[0] == _PACKAGE:
+            raise ConfigError(
+                f"{target} is not registered, so that no checkpoint of it could be read: give it a line in "
+                "PARTS of raytran/checkpoints/network.py"
+            )
+        return target
+
+    return _with_targets(config, named)
+
+
+def with_import_paths(config: Any) -> Any:
+    """Return the config of a network with import paths in place of the names of ``PARTS``."""
+    return _with_targets(config, lambda name: f"{PARTS[name]}.{name}" if name in PARTS else name)
+
+
+def _with_targets(node: Any, change: Callable[[str], str]) -> Any:
+    if isinstance(node, Mapping):
+        return {
+            name: change(value) if name == "_target_" else _with_targets(value, change)
+            for name, value in node.items()
+        }
+    return [_with_targets(value, change) for value in node] if isinstance(node, list | tuple) else node
+
+
 def build_network(config: Mapping[str, Any], source: object, *, trust: Iterable[str] = ()) -> nn.Module:
     """Return the network that ``config`` describes, without any weights of its own.
 
-    A node with ``_target_`` stands for a class of raytran's networks, or of a package in ``trust``, the other
-    keys for its arguments; there is nothing else: no functions, no classes that a module has only imported
-    from elsewhere, no references to resolve.
+    A node with ``_target_`` stands for a class of ``PARTS``, or of a package in ``trust``, the other keys for
+    its arguments; with ``_partial_`` for a function that makes one. There is nothing else: no functions of a
+    module, no classes that a module has only imported from elsewhere, no references to resolve.
 
     Args:
         config: the config from a checkpoint.
@@ -87,36 +147,35 @@ def build_network(config: Mapping[str, Any], source: object, *, trust: Iterable[
 
 
 def _build(node: Any, source: object, trusted: tuple[str, ...]) -> Any:
-    if isinstance(node, Mapping):
-        values = {name: _build(value, source, trusted) for name, value in node.items() if name != "_target_"}
-        if any(not isinstance(name, str) or name.startswith("_") for name in values):
-            raise CheckpointError(f"the network described in {source} has odd settings: do not use this file")
-        if "_target_" not in node:
-            return values
-        found = _class(node["_target_"], source, trusted)
-        if "weights" in values:
-            values["weights"] = None  # they are in the checkpoint: nothing is to be read or fetched
-        if found.__module__.partition(".")[0] == _PACKAGE:
-            for name in _NOT_THE_NETWORK:
-                values.pop(name, None)
-        return found(**values)
     if isinstance(node, list | tuple):
         return [_build(value, source, trusted) for value in node]
-    if not isinstance(node, _PLAIN):
-        raise CheckpointError(f"the network described in {source} has odd settings: do not use this file")
-    return node
+    if not isinstance(node, Mapping):
+        if not isinstance(node, _PLAIN):
+            raise _odd(source)
+        return node
+    settings = {name: value for name, value in node.items() if name not in ("_target_", "_partial_")}
+    values = {name: _build(value, source, trusted) for name, value in settings.items()}
+    if any(not isinstance(name, str) or name.startswith("_") for name in values):
+        raise _odd(source)
+    if "_target_" not in node:
+        return values
+    network = _class(node["_target_"], source, trusted)
+    if "weights" in values:
+        values["weights"] = None  # they are in the checkpoint: nothing is to be read or fetched
+    if network.__module__.partition(".")[0] == _PACKAGE:
+        for name in _NOT_THE_NETWORK:
+            values.pop(name, None)
+    return functools.partial(network, **values) if node.get("_partial_") is True else network(**values)
 
 
 def _class(target: Any, source: object, trusted: tuple[str, ...]) -> type[nn.Module]:
-    """Return the class of that name, if it is a network of raytran or of a trusted package."""
+    """Return the class of that name, if it is a part of raytran's networks or of a trusted package's."""
+    # The name is looked at before anything is imported: an import runs code as well.
+    if isinstance(target, str) and target in PARTS:
+        return getattr(importlib.import_module(PARTS[target]), target)
     module, _, name = str(target).rpartition(".")
     package = module.partition(".")[0]
-    # The name is looked at before anything is imported: an import runs code as well.
-    if _MODULE.fullmatch(module):
-        found = _attribute(module, name)
-        if _is_network(found) and found.__module__ == module:
-            return found
-    elif package in trusted:
+    if package in trusted:
         # A class may be named where its package shows it, but it must be of a trusted package itself.
         found = _attribute(module, name)
         if _is_network(found) and found.__module__.partition(".")[0] in trusted:
@@ -130,6 +189,10 @@ def _class(target: Any, source: object, trusted: tuple[str, ...]) -> type[nn.Mod
         f"{source} asks to run '{target}', which is no network of raytran: do not use this file"
         + (advice if package.isidentifier() and package != _PACKAGE else "")
     )
+
+
+def _odd(source: object) -> CheckpointError:
+    return CheckpointError(f"the network described in {source} has odd settings: do not use this file")
 
 
 def _attribute(module: str, name: str) -> Any:

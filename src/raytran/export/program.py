@@ -9,6 +9,7 @@ raytran, which is several times faster and must be imported first.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -71,14 +72,14 @@ class NetworkProgram(nn.Module):
         cells = (self.image_size[0] // backbone.stride) * (self.image_size[1] // backbone.stride)
         pairs = PairList(pixel_index, voxel_index, images.shape[0] * cells, grid.num_voxels)
         with_pixels = "foreground" in self.tasks
-        voxels, pixels = backbone(images[None], cameras, grid, pairs, with_pixels=with_pixels)
+        voxels, pixels = backbone([images[None]], [cameras], grid, [pairs], with_pixels=with_pixels)
         found = {}
         if "occupancy" in self.tasks:
             found["occupancy"] = heads["occupancy"](voxels)[0]
         if pixels is not None:
-            found["foreground"] = heads["foreground"](pixels)[0]
+            found["foreground"] = heads["foreground"](pixels[0])[0]
         if "objects" in self.tasks:
-            last = heads["objects"](voxels, grid)[0][-1]
+            last = heads["objects"](voxels, grid).layers[-1]
             of_queries = ("class_logits", "center", "log_size", "yaw_vector", "embedding")
             found |= {name: getattr(last, name)[0] for name in of_queries}
         return found
@@ -94,15 +95,13 @@ def example_inputs(model: RayTran, cameras: Cameras, *, seed: int = 0) -> tuple[
     """
     height, width = cameras.image_size
     generator = torch.Generator().manual_seed(seed)
-    size = (cameras.position.shape[0], model.backbone.resnet.input_channels, height, width)
+    size = (cameras.position.shape[0], model.backbone.encoder.input_channels, height, width)
     images = torch.randint(0, 256, size, dtype=torch.uint8, generator=generator)
     intrinsics, poses = cameras.intrinsics.float(), cameras.world_from_camera.float()
     center = poses[:, :3, 3].mean(dim=0)
     grid = VoxelGrid(model.grid_resolution, model.grid_extent, center[None])
-    feature_size = (height // model.backbone.stride, width // model.backbone.stride)
     one_scene = Cameras(intrinsics[None], poses[None], (height, width))
-    tracer = model.backbone.tracer or model.ray_tracer
-    pairs = tracer(one_scene, grid, feature_size, model.rays_per_cell)
+    pairs = cast("PairList", model.trace(one_scene, grid))  # on the CPU it is a list
     return images, intrinsics, poses, center, pairs.pixel_index, pairs.voxel_index
 
 

@@ -1,23 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One layer of the DETR-style decoder: queries attend to each other and to the voxels (RayTran §3.2).
-
-Each query has a reference point in the volume. It attends to all voxels alike, as in DETR, or through a
-Gaussian window around that point, whose offset and width every head learns (SMCA, Gao et al., ICCV 2021); it
-then reads, besides the features, the mean position of the voxels attended, relative to the reference point.
-Plain DETR has to learn both from data, which takes hundreds of epochs.
-"""
+"""One layer of the DETR-style decoder: queries attend to each other and to the voxels (RayTran §3.2)."""
 
 from __future__ import annotations
 
-import torch
+from collections.abc import Callable
+
 import torch.nn.functional as F
 from torch import Tensor, nn
-
-WIDTHS = (0.3, 1.0)
-"""Widths (standard deviation, metres) of the narrowest and of the widest head's window before training."""
-
-UNIT = 0.1
-"""Metres in which relative positions are read; at this scale a decimetre counts as much as a feature does."""
 
 
 class DecoderLayer(nn.Module):
@@ -27,16 +16,24 @@ class DecoderLayer(nn.Module):
         channels: C of queries and voxels.
         num_heads: attention heads.
         hidden: channels inside the feed-forward.
-        windowed: attend through a window around the reference point instead of to all voxels alike.
+        voxel_attention: called with ``channels`` and ``num_heads``, returns what queries read voxels with;
+            None for ``VoxelAttention``, as in the paper.
     """
 
-    def __init__(self, *, channels: int, num_heads: int, hidden: int, windowed: bool) -> None:
+    def __init__(
+        self,
+        *,
+        channels: int,
+        num_heads: int,
+        hidden: int,
+        voxel_attention: Callable[..., nn.Module] | None = None,
+    ) -> None:
         super().__init__()
         self.self_norm = nn.LayerNorm(channels)
         self.self_attention = nn.MultiheadAttention(channels, num_heads, batch_first=True)
         self.voxel_norm = nn.LayerNorm(channels)
-        attention = WindowedAttention if windowed else VoxelAttention
-        self.voxel_attention = attention(channels=channels, num_heads=num_heads)
+        make_attention = VoxelAttention if voxel_attention is None else voxel_attention
+        self.voxel_attention = make_attention(channels=channels, num_heads=num_heads)
         self.feed_forward = nn.Sequential(
             nn.LayerNorm(channels), nn.Linear(channels, hidden), nn.GELU(), nn.Linear(hidden, channels)
         )
@@ -90,61 +87,11 @@ class VoxelAttention(nn.Module):
 
     def forward(self, queries: Tensor, reference: Tensor, memory: Tensor, voxel_position: Tensor) -> Tensor:
         """Return ``(B, Q, C)``; the arguments are those of ``DecoderLayer.forward``."""
-        query, key, value = (
-            self._heads(x) for x in (self.query(queries), self.key(memory), self.value(memory))
-        )
+        query = self._heads(self.query(queries))
+        key = self._heads(self.key(memory))
+        value = self._heads(self.value(memory))
         return self.output(F.scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(2))
 
     def _heads(self, x: Tensor) -> Tensor:
         """Map ``(B, n, C)`` to ``(B, heads, n, D)``."""
         return x.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
-
-
-class WindowedAttention(VoxelAttention):
-    """Multi-head attention to voxels, in a Gaussian window around each query's reference point.
-
-    The score of query q and voxel v in a head is ``q·k / √D - |x_v - c|² / 2σ²``. Up to a constant in v,
-    which the softmax cancels, its second term is the dot product of ``(c, -½) / σ²`` and ``(x_v, |x_v|²)``:
-    four more channels of query and key, so that no bias matrix of Q × V is ever stored.
-
-    Args:
-        channels: C.
-        num_heads: attention heads.
-    """
-
-    def __init__(self, *, channels: int, num_heads: int) -> None:
-        super().__init__(channels=channels, num_heads=num_heads)
-        self.window = nn.Linear(channels, 4 * num_heads)
-        self.output = nn.Linear(channels + 3 * num_heads, channels)
-        nn.init.normal_(self.window.weight, std=0.01)
-        with torch.no_grad():
-            log_width = torch.tensor(WIDTHS).log()
-            bias = self.window.bias.view(num_heads, 4).zero_()
-            bias[:, 3] = torch.lerp(log_width[0], log_width[1], torch.linspace(0, 1, num_heads))
-
-    def forward(self, queries: Tensor, reference: Tensor, memory: Tensor, voxel_position: Tensor) -> Tensor:
-        """Return ``(B, Q, C)``; the arguments are those of ``DecoderLayer.forward``."""
-        query, key, value = self.query(queries), self.key(memory), self.value(memory)
-        # Squares of metres need more digits than 16-bit floats have.
-        with torch.autocast(queries.device.type, enabled=False):
-            query, key, value = (self._heads(x.float()) for x in (query, key, value))
-            squared = voxel_position.square().sum(dim=-1, keepdim=True)
-            place = torch.cat([voxel_position, squared], dim=-1).expand(*key.shape[:3], 4)
-            window = self._window(self.window(queries.float()), reference.float())
-            attended = F.scaled_dot_product_attention(
-                torch.cat([query / query.shape[-1] ** 0.5, window], dim=-1),
-                torch.cat([key, place], dim=-1),
-                torch.cat([value, place], dim=-1),
-                scale=1.0,
-            )
-            features, mean_position = attended[..., :-4], attended[..., -4:-1]
-            relative = (mean_position - reference.float()[:, None]) / UNIT
-            read = torch.cat([features, relative], dim=-1).transpose(1, 2).flatten(2)
-        return self.output(read)
-
-    def _window(self, parameters: Tensor, reference: Tensor) -> Tensor:
-        """Return ``(c, -½) / σ²``, ``(B, heads, Q, 4)``."""
-        parameters = self._heads(parameters)
-        center = reference[:, None] + parameters[..., :3]
-        precision = torch.exp(-2 * parameters[..., 3:])
-        return torch.cat([center, torch.full_like(precision, -0.5)], dim=-1) * precision

@@ -3,47 +3,56 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import fields
-from typing import Literal
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from raytran.errors import ConfigError
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.position import position_code
+from raytran.geometry.rotation import rotation_from_yaw
 from raytran.heads.decoder import DecoderLayer
-from raytran.heads.denoising import NoisyCopies, attention_mask, join_queries
-from raytran.heads.queries import LearnedQueries, ProposalQueries, Queries
-from raytran.structs import CLASSES, ObjectSet, RawObjects, RawProposals
+from raytran.heads.queries import LearnedQueries, Queries
+from raytran.structs import CLASSES, PADDING, ObjectSet, RawObjects, RawProposals
+
+
+class ObjectOutputs(NamedTuple):
+    """What the object head returns.
+
+    Attributes:
+        layers: predictions of every decoder layer, last layer last.
+        proposals: of all voxels, where they propose the queries.
+        denoising: as ``layers``, for noisy copies of true objects, where the head learns to correct such.
+    """
+
+    layers: tuple[RawObjects, ...]
+    proposals: RawProposals | None = None
+    denoising: tuple[RawObjects, ...] | None = None
 
 
 class ObjectHead(nn.Module):
-    """Predicts the objects of a scene in ``num_queries`` slots, after every decoder layer.
+    """Predicts the objects of a scene from ``num_queries`` queries, after every decoder layer.
 
     Every query is an embedding and a reference point in the volume. A layer predicts the centre as an offset
     from the reference point, and hands it on as the reference of the next layer (Deformable DETR, Zhu et al.,
     ICLR 2021, but with gradients: early layers learn to aim for late ones).
+
+    What is passed as a callable is chosen in the config by ``_target_`` with ``_partial_``; left out, it is
+    the paper's (``raytran.extensions`` has others).
 
     Args:
         channels: C of the voxel features and queries.
         num_heads: attention heads.
         num_layers: decoder layers L.
         num_queries: Q.
-        queries: ``"learned"``, the same for every scene as in the paper, or ``"proposal"``, the voxels most
-            likely to hold an object's centre, which learns from few scenes.
         hidden: channels inside the decoder's feed-forward.
-        windowed: attend to the voxels through a learned window around the reference point, which learns from
-            few scenes; False attends to all voxels alike, as in DETR and the paper.
-        refines: what a layer hands on to the next, which predicts the difference: ``"center"``, or ``"box"``,
-            size and yaw too (iterative box refinement in Deformable DETR).
-        num_copies: noisy copies of the true objects that a scene's queries are joined by in training, to be
-            corrected (``raytran.heads.denoising``); 0 for none, as in the paper.
         grid_extent: sizes of the voxel grid, metres.
-
-    Raises:
-        ConfigError: ``queries`` or ``refines`` is unknown, or ``num_copies`` is negative.
+        queries: called with ``channels`` and ``num_queries``, returns a module from ``(voxels, grid)`` to
+            ``Queries``; None for ``LearnedQueries``.
+        voxel_attention: what queries read the voxels with, see ``DecoderLayer``.
+        refinement: from what a layer started from and what it predicts to what the next one starts from; None
+            for ``CenterRefinement``.
     """
 
     extent: Tensor
@@ -55,100 +64,86 @@ class ObjectHead(nn.Module):
         num_heads: int = 8,
         num_layers: int = 6,
         num_queries: int = 64,
-        queries: Literal["learned", "proposal"] = "learned",
         hidden: int = 1024,
-        windowed: bool = False,
-        refines: Literal["center", "box"] = "center",
-        num_copies: int = 0,
         grid_extent: Sequence[float] = (9.0, 9.0, 3.5),
+        queries: Callable[..., nn.Module] | None = None,
+        voxel_attention: Callable[..., nn.Module] | None = None,
+        refinement: nn.Module | None = None,
     ) -> None:
         super().__init__()
-        if queries not in ("learned", "proposal"):
-            raise ConfigError(f"unknown queries={queries}: choose learned or proposal")
-        if refines not in ("center", "box"):
-            raise ConfigError(f"unknown refines={refines}: choose center or box")
-        if num_copies < 0:
-            raise ConfigError(f"num_copies must be 0 or more, got {num_copies}")
-        self.refines = refines
         self.grid_extent = tuple(float(length) for length in grid_extent)
         self.register_buffer("extent", torch.tensor(self.grid_extent), persistent=False)
-        self.queries: nn.Module = (
+        self.queries = (
             LearnedQueries(channels=channels, num_queries=num_queries, extent=self.grid_extent)
-            if queries == "learned"
-            else ProposalQueries(channels=channels, num_queries=num_queries)
+            if queries is None
+            else queries(channels=channels, num_queries=num_queries)
         )
         self.position = nn.Linear(channels, channels)
         self.layers = nn.ModuleList(
-            DecoderLayer(channels=channels, num_heads=num_heads, hidden=hidden, windowed=windowed)
+            DecoderLayer(
+                channels=channels, num_heads=num_heads, hidden=hidden, voxel_attention=voxel_attention
+            )
             for _ in range(num_layers)
         )
         self.predictors = nn.ModuleList(ObjectPredictor(channels=channels) for _ in range(num_layers))
-        # Last, so that the other parts start from the same weights with and without.
-        self.copies = NoisyCopies(channels=channels, num_copies=num_copies) if num_copies else None
+        self.refinement = CenterRefinement() if refinement is None else refinement
 
-    def forward(self, voxels: Tensor, grid: VoxelGrid) -> tuple[tuple[RawObjects, ...], RawProposals | None]:
-        """Return the predictions of every layer, last layer last, and the proposals if queries are proposed.
-
-        Args:
-            voxels: ``(B, X, Y, Z, C)`` features.
-            grid: the voxel grids, ``center`` ``(B, 3)``.
-        """
-        start: Queries = self.queries(voxels, grid)
-        return self._decode(start, voxels, grid), start.proposals
-
-    @property
-    def makes_copies(self) -> bool:
-        """Whether ``forward_with_copies`` has any: in training mode, if there are to be any."""
-        return self.copies is not None and self.training
-
-    def forward_with_copies(
-        self, voxels: Tensor, grid: VoxelGrid, known: Sequence[ObjectSet]
-    ) -> tuple[tuple[RawObjects, ...], RawProposals | None, tuple[RawObjects, ...]]:
-        """Return what ``forward`` does, and the predictions of every layer for noisy copies of true objects.
-
-        The copies change nothing of the others.
+    def forward(
+        self, voxels: Tensor, grid: VoxelGrid, true_objects: Sequence[ObjectSet] | None = None
+    ) -> ObjectOutputs:
+        """Return the predictions of every layer.
 
         Args:
             voxels: ``(B, X, Y, Z, C)`` features.
             grid: the voxel grids, ``center`` ``(B, 3)``.
-            known: the true objects of B scenes.
-
-        Raises:
-            ConfigError: the head makes no copies.
+            true_objects: of B scenes, in training; for heads that learn from noisy copies of them. Not read
+                here.
         """
-        if self.copies is None:
-            raise ConfigError("this object head makes no copies: set model.heads.objects.num_copies")
-        start: Queries = self.queries(voxels, grid)
-        count = start.embedding.shape[1]
-        mask = attention_mask(count, self.copies.num_copies, voxels.device)
-        joined = join_queries(start, self.copies(known, start, grid))
-        layers = self._decode(joined, voxels, grid, mask)
-        own = tuple(_slots(layer, slice(count)) for layer in layers)
-        return own, start.proposals, tuple(_slots(layer, slice(count, None)) for layer in layers)
+        queries: Queries = self.queries(voxels, grid)
+        return ObjectOutputs(self.decode(queries, voxels, grid), queries.proposals)
 
-    def _decode(
-        self, start: Queries, voxels: Tensor, grid: VoxelGrid, mask: Tensor | None = None
+    def decode(
+        self, queries: Queries, voxels: Tensor, grid: VoxelGrid, mask: Tensor | None = None
     ) -> tuple[RawObjects, ...]:
-        """Return the predictions of every layer for the queries of ``start``."""
+        """Return the predictions of every layer for some queries.
+
+        Args:
+            queries: what the first layer starts from.
+            voxels: ``(B, X, Y, Z, C)`` features.
+            grid: the voxel grids, ``center`` ``(B, 3)``.
+            mask: ``(Q, Q)`` bool, which queries must not attend to which, see ``DecoderLayer.forward``.
+        """
         grid_center = grid.center.to(self.extent.dtype)
         at_origin = VoxelGrid(grid.resolution, grid.extent, torch.zeros_like(self.extent))
         voxel_position = at_origin.voxel_centers().flatten(0, 2)
-        memory = voxels.flatten(1, 3) + self._locate(voxel_position)
-        embedding, box = start.embedding, start
+        memory = voxels.flatten(1, 3) + self._encode_positions(voxel_position)
+        embedding = queries.embedding
         outputs = []
         for layer, predictor in zip(self.layers, self.predictors, strict=True):
-            position = self._locate(box.reference)
-            embedding = layer(embedding, position, box.reference, memory, voxel_position, mask)
-            objects = predictor(embedding, box, grid_center)
-            box = box._replace(reference=objects.center - grid_center[:, None])
-            if self.refines == "box":
-                box = box._replace(log_size=objects.log_size, yaw_vector=objects.yaw_vector)
+            position = self._encode_positions(queries.reference)
+            embedding = layer(embedding, position, queries.reference, memory, voxel_position, mask)
+            objects = predictor(embedding, queries, grid_center)
+            queries = self.refinement(queries, objects, grid_center)
             outputs.append(objects)
         return tuple(outputs)
 
-    def _locate(self, points: Tensor) -> Tensor:
+    def _encode_positions(self, points: Tensor) -> Tensor:
         """Return the code ``(..., C)`` of points ``(..., 3)``, metres from the centre of the volume."""
         return self.position(position_code(points, self.grid_extent, self.position.in_features))
+
+
+class CenterRefinement(nn.Module):
+    """The next layer starts from the predicted centre; size and yaw are predicted anew."""
+
+    def forward(self, start: Queries, objects: RawObjects, grid_center: Tensor) -> Queries:
+        """Return what the next layer starts from.
+
+        Args:
+            start: what the layer started from.
+            objects: what it predicts.
+            grid_center: ``(B, 3)`` metres.
+        """
+        return start._replace(reference=objects.center - grid_center[:, None])
 
 
 class ObjectPredictor(nn.Module):
@@ -181,13 +176,38 @@ class ObjectPredictor(nn.Module):
         )
 
 
-def _slots(objects: RawObjects, some: slice) -> RawObjects:
-    return RawObjects(*(getattr(objects, field.name)[:, some] for field in fields(objects)))
-
-
 def _perceptron(channels: int, outputs: int) -> nn.Sequential:
     """Return a network of one hidden layer whose output is close to zero before training."""
     last = nn.Linear(channels, outputs)
     nn.init.normal_(last.weight, std=0.01)
     nn.init.zeros_(last.bias)
     return nn.Sequential(nn.Linear(channels, channels), nn.GELU(), last)
+
+
+def objects_of_queries(
+    raw: RawObjects, scene: int, *, score_threshold: float = 0.0
+) -> tuple[ObjectSet, Tensor]:
+    """Return one scene's objects, highest score first, and their embeddings.
+
+    Args:
+        raw: one decoder layer's output for B scenes.
+        scene: which of them.
+        score_threshold: queries whose best class has a lower probability are left out.
+
+    Returns:
+        M objects without shapes, and ``(M, C)`` embeddings.
+    """
+    probability = raw.class_logits[scene].softmax(dim=-1)[:, :PADDING]
+    score, label = probability.max(dim=-1)
+    order = score.argsort(descending=True, stable=True)
+    order = order[score[order] >= score_threshold]
+    sin, cos = raw.yaw_vector[scene, order].unbind(dim=-1)
+    objects = ObjectSet(
+        label=label[order],
+        center=raw.center[scene, order],
+        size=raw.log_size[scene, order].exp(),
+        rotation=rotation_from_yaw(torch.atan2(sin, cos)),
+        symmetry=torch.ones_like(label[order]),
+        score=score[order],
+    )
+    return objects, raw.embedding[scene, order]

@@ -30,12 +30,12 @@ class ShapeHead(nn.Module):
             _normalize(self.widths[-1]),
             nn.ConvTranspose3d(self.widths[-1], 1, 3, stride=2, padding=1),
         ]
-        self.grow = nn.Sequential(*layers)
+        self.upsampler = nn.Sequential(*layers)
 
     def forward(self, embedding: Tensor) -> Tensor:
         """Map embeddings ``(M, C)`` to occupancy logits ``(M, 63, 63, 63)``, indexed [x, y, z]."""
         start = self.start(embedding).view(-1, self.widths[0], 4, 4, 4)
-        return self.grow(start).squeeze(1)
+        return self.upsampler(start).squeeze(1)
 
 
 def _normalize(width: int) -> nn.Sequential:

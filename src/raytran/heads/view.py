@@ -4,15 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from torch import Tensor, nn
 
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.position import ray_code
-from raytran.heads.grow import growing_layers
-from raytran.ops.pairs import PairList
-from raytran.ops.triton.block_pairs import BlockPairs
+from raytran.heads.dense import image_upsampler
+from raytran.ops.ray_attention import Pairs
 
 
 class ViewHead(nn.Module):
@@ -34,13 +34,11 @@ class ViewHead(nn.Module):
         self.stride = 2 ** (len(widths) + 1)
         self.ray_position = nn.Sequential(nn.Linear(6, channels), nn.GELU(), nn.Linear(channels, channels))
         self.ray_norm = nn.LayerNorm(channels)
-        self.stream = stream
+        self.stream: Any = stream  # a Stream, which this folder does not import
         self.pixel_norm = nn.LayerNorm(channels)
-        self.grow = growing_layers(channels, widths, outputs=3)
+        self.upsampler = image_upsampler(channels, widths, outputs=3)
 
-    def forward(
-        self, voxels: Tensor, cameras: Cameras, grid: VoxelGrid, pairs: PairList | BlockPairs
-    ) -> Tensor:
+    def forward(self, voxels: Tensor, cameras: Cameras, grid: VoxelGrid, pairs: Pairs) -> Tensor:
         """Return images as logits of red, green and blue, ``(B, V, 3, H, W)``.
 
         Args:
@@ -51,6 +49,7 @@ class ViewHead(nn.Module):
         """
         height, width = cameras.image_size
         rays = self.ray_position(ray_code(cameras, grid, (height // self.stride, width // self.stride)))
-        pixels = self.stream(rays, self.ray_norm(rays), voxels, pairs)
-        logits = self.grow(self.pixel_norm(pixels).movedim(-1, 1))
+        of_voxels = self.stream.keys_and_values(voxels)
+        pixels = self.stream(rays, self.ray_norm(rays), [of_voxels], [pairs])
+        logits = self.upsampler(self.pixel_norm(pixels).movedim(-1, 1))
         return logits.unflatten(0, cameras.intrinsics.shape[:2])

@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor, nn
 
 from raytran.errors import ConfigError
-from raytran.losses.pose import Betas, pose_errors
+from raytran.losses.objects import Betas, Match, pose_errors
 from raytran.structs import ObjectSet, RawObjects
 
 UNUSABLE = 1e6
@@ -19,18 +19,6 @@ UNUSABLE = 1e6
 
 
 CLASS_COSTS = ("probability", "cross_entropy")
-
-
-class Match(NamedTuple):
-    """Matched pairs of one scene.
-
-    Attributes:
-        slot: ``(m,)`` int64, query slot of each pair.
-        target: ``(m,)`` int64, true object of each pair; m = min(Q, M).
-    """
-
-    slot: Tensor
-    target: Tensor
 
 
 class HungarianMatcher(nn.Module):

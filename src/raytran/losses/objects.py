@@ -1,17 +1,97 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Losses of class and pose (RayTran §3.2)."""
+"""Class and pose of the objects: the errors that matching and loss add up, and the loss (RayTran §3.2)."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from raytran.losses.matcher import Match
-from raytran.losses.pose import Betas, pose_errors
+from raytran.errors import ConfigError
+from raytran.geometry.rotation import symmetric_yaw_error, yaw_from_rotation
 from raytran.structs import PADDING, ObjectSet, RawObjects
+
+
+class Match(NamedTuple):
+    """Matched pairs of one scene.
+
+    Attributes:
+        slot: ``(m,)`` int64, query slot of each pair.
+        target: ``(m,)`` int64, true object of each pair; m = min(Q, M).
+    """
+
+    slot: Tensor
+    target: Tensor
+
+
+class Betas(NamedTuple):
+    """Errors at which smooth L1 turns from a square to a line; 0 makes it a line throughout.
+
+    Attributes:
+        center: along each axis, metres.
+        yaw: radians.
+    """
+
+    center: float = 0.1
+    yaw: float = 0.1
+
+    def checked(self) -> Betas:
+        """Return them as numbers.
+
+        Raises:
+            ConfigError: one is negative or not finite.
+        """
+        for name, beta in self._asdict().items():
+            if not 0 <= beta < math.inf:
+                raise ConfigError(f"{name}_beta={beta}: give a length or an angle, at least 0")
+        return Betas(float(self.center), float(self.yaw))
+
+
+def pose_errors(
+    center: Tensor, log_size: Tensor, yaw_vector: Tensor, target: ObjectSet, betas: Betas
+) -> dict[str, Tensor]:
+    """Return the pose losses of predictions against true objects, not reduced over objects.
+
+    Smooth L1 of the centre and L1 of the logarithm of the size, each summed over the three axes, and smooth
+    L1 of the yaw, wrapped and taken as the least over the target's symmetries.
+
+    Args:
+        center: ``(..., M or 1, 3)`` metres.
+        log_size: ``(..., M or 1, 3)``.
+        yaw_vector: ``(..., M or 1, 2)`` (sin, cos), of any length.
+        target: M true objects.
+        betas: of smooth L1.
+
+    Returns:
+        ``center``, ``size`` and ``yaw``, each ``(..., M)``.
+    """
+    yaw = yaw_from_vector(yaw_vector)
+    yaw_error = symmetric_yaw_error(yaw, yaw_from_rotation(target.rotation), target.symmetry)
+    return {
+        "center": _smooth_l1(center - target.center, betas.center).sum(dim=-1),
+        "size": (log_size - target.size.log()).abs().sum(dim=-1),
+        "yaw": _smooth_l1(yaw_error, betas.yaw),
+    }
+
+
+def _smooth_l1(error: Tensor, beta: float) -> Tensor:
+    return F.smooth_l1_loss(error, torch.zeros_like(error), reduction="none", beta=beta)
+
+
+def yaw_from_vector(yaw_vector: Tensor) -> Tensor:
+    """Return the angle of ``(..., 2)`` (sin, cos), ``(...)`` radians, with a gradient of length one.
+
+    The true gradient is as long as one over the vector's length: it explodes near zero and fades far away.
+    This one is that of the vector on the unit circle, whatever its length; it only turns the vector.
+    """
+    length = torch.linalg.vector_norm(yaw_vector.detach(), dim=-1, keepdim=True)
+    unit = torch.where(length > 0, yaw_vector.detach() / length, yaw_vector.new_tensor([0.0, 1.0]))
+    sin, cos = (unit + (yaw_vector - yaw_vector.detach())).unbind(dim=-1)
+    return torch.atan2(sin, cos)
 
 
 def object_losses(

@@ -4,22 +4,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import fields, replace
 from typing import Literal, TypeVar
 
 import torch
 from torch import Tensor, nn
 
 from raytran.errors import ConfigError, DataError
-from raytran.losses.denoising import denoising_losses
-from raytran.losses.foreground import foreground_loss
-from raytran.losses.matcher import HungarianMatcher, Match
-from raytran.losses.objects import object_losses
-from raytran.losses.occupancy import occupancy_loss
-from raytran.losses.pose import Betas
-from raytran.losses.proposals import proposal_losses
-from raytran.losses.shape import shape_loss
-from raytran.losses.view import view_loss
+from raytran.losses.matcher import HungarianMatcher
+from raytran.losses.objects import Betas, Match, object_losses
+from raytran.losses.terms import foreground_loss, occupancy_loss, shape_loss, view_loss
 from raytran.structs import ObjectSet, RawObjects, RawScene, SceneBatch
 
 WEIGHTS = ("occupancy", "foreground", "class", "center", "size", "yaw", "heat", "shape", "view")
@@ -41,6 +34,8 @@ class TotalLoss(nn.Module):
             each with its own matches and all alike, as class and pose; that decodes as many times the grids.
         center_beta: of the centre's smooth L1, see ``Betas``.
         yaw_beta: of the yaw's.
+        extensions: further terms of the objects by name, called as ``ProposalLoss``: from what the network
+            returned and the true objects to values that have names of weights. None for none (the paper).
 
     Raises:
         ConfigError: a weight is missing or unknown, there is no such choice, or a beta is negative.
@@ -55,6 +50,7 @@ class TotalLoss(nn.Module):
         shape_layers: Literal["last", "all"] = "last",
         center_beta: float = Betas().center,
         yaw_beta: float = Betas().yaw,
+        extensions: Mapping[str, nn.Module] | None = None,
     ) -> None:
         super().__init__()
         if shape_layers not in SHAPE_LAYERS:
@@ -66,6 +62,7 @@ class TotalLoss(nn.Module):
         self.no_object_weight = no_object_weight
         self.shape_layers = shape_layers
         self.betas = Betas(center_beta, yaw_beta).checked()
+        self.extensions = nn.ModuleDict(extensions or {})
 
     def forward(
         self,
@@ -92,7 +89,7 @@ class TotalLoss(nn.Module):
         Returns:
             ``occupancy``, ``foreground``, ``shape``, ``view``; ``objects/class``, ``objects/center``,
             ``objects/size``, ``objects/yaw`` of the last decoder layer, ``objects/class/layer0`` … of earlier
-            ones, ``objects/heat/proposals`` … and ``objects/class/copies`` … if the network makes any, and
+            ones, ``objects/heat/proposals`` … of the extension ``proposals`` and so on of others, and
             ``shape/layer0`` … of earlier layers if all tell shapes.
 
         Raises:
@@ -128,7 +125,7 @@ class TotalLoss(nn.Module):
         mean_over_ranks: Callable[[Tensor], Tensor] | None,
     ) -> dict[str, Tensor]:
         layers, targets = _both("objects", raw.objects, batch.objects)
-        layers = tuple(_in_float32(layer) for layer in layers)
+        layers = tuple(layer.in_float32() for layer in layers)
         num_objects, class_weight = self._divisors(layers[-1], targets, mean_over_ranks)
         last = self.matcher(layers[-1], targets)
         losses: dict[str, Tensor] = {}
@@ -156,13 +153,10 @@ class TotalLoss(nn.Module):
             )
             suffix = "" if is_last else f"/layer{index}"
             losses |= {f"objects/{name}{suffix}": value for name, value in found.items()}
-        if "objects" in terms and raw.proposals is not None:
-            found = proposal_losses(raw.proposals, targets, num_objects=num_objects, betas=self.betas)
-            losses |= {f"objects/{name}/proposals": value for name, value in found.items()}
-        if "objects" in terms and raw.copies is not None:
-            copies = [_in_float32(layer) for layer in raw.copies]
-            found = denoising_losses(copies, targets, betas=self.betas)
-            losses |= {f"objects/{name}/copies": value for name, value in found.items()}
+        if "objects" in terms:
+            for name, extension in self.extensions.items():
+                found = extension(raw, targets, num_objects=num_objects, betas=self.betas)
+                losses |= {f"objects/{term}/{name}": value for term, value in found.items()}
         return losses
 
     def _divisors(
@@ -205,12 +199,6 @@ def _matched_shape_loss(
         return 0.0 * decode_shapes(raw.embedding[:1, 0]).float().sum()
     wanted = [o.shape[match.target] for o, match in zip(targets, matches, strict=True) if o.shape is not None]
     return shape_loss(decode_shapes(embedding), torch.cat(wanted), num_objects=num_objects)
-
-
-def _in_float32(raw: RawObjects) -> RawObjects:
-    """Return the predictions in float32, but the embedding as the network made it: it goes back there."""
-    exact = {f.name: getattr(raw, f.name).float() for f in fields(raw) if f.name != "embedding"}
-    return replace(raw, **exact)
 
 
 def _under_current_autocast(function: Callable[[Tensor], Tensor], device: str) -> Callable[[Tensor], Tensor]:

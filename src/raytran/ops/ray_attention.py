@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Ray-traced sparse attention between the pixels and voxels that a ray joins (RayTran §3.1).
 
-On a GPU with Triton it runs in fused kernels over blocks of pairs (``block_attention``), elsewhere by
-products of torch's sparse matrices over the list of pairs (``pair_attention``). Neither makes the matrix of
+On a GPU with Triton it runs in fused kernels over blocks of pairs (``ops.triton``), elsewhere by products of
+torch's sparse matrices over the list of pairs (``ops.sparse``). Neither makes the matrix of
 all scores, and the same input gives the same bits.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from math import log
 from typing import Literal
 
@@ -15,19 +16,22 @@ import torch
 from torch import Tensor
 
 from raytran.errors import check_shape
-from raytran.ops.pair_attention import pair_attention
 from raytran.ops.pairs import PairList
+from raytran.ops.sparse import pair_attention
 from raytran.ops.triton.block_pairs import BlockPairs
 from raytran.ops.triton.dispatch import fused_blocks, listed
 
 Direction = Literal["pixels_to_voxels", "voxels_to_pixels"]
+
+Pairs = PairList | BlockPairs
+"""The pixel-voxel pairs of some views: a list for ``torch.sparse``, or blocks for the fused kernels."""
 
 
 def ray_attention(
     query: Tensor,
     key: Tensor,
     value: Tensor,
-    pairs: PairList | BlockPairs,
+    pairs: Pairs,
     direction: Direction = "pixels_to_voxels",
 ) -> Tensor:
     """Let each target attend to the sources that a ray joins it with.
@@ -52,11 +56,51 @@ def ray_attention(
     return _attend(query, key, value, pairs, direction)[0]
 
 
+def ray_attention_in_chunks(
+    query: Tensor,
+    keys_and_values: Iterable[tuple[Tensor, Tensor]],
+    pairs: Sequence[Pairs],
+    direction: Direction = "pixels_to_voxels",
+) -> Tensor:
+    """Return ``ray_attention`` over sources that come in chunks, of which one at a time is read.
+
+    One chunk is ``ray_attention`` itself. Several are joined by the online softmax of Milakov & Gimelshein
+    (2018), and have no gradient: each chunk's result counts by the sum of its exponentials.
+
+    Args:
+        query: ``(T, H, D)``.
+        keys_and_values: of each chunk, each ``(S, H, D)``.
+        pairs: of each chunk, with the same targets.
+        direction: from the source to the target.
+
+    Returns:
+        ``(T, H, D)`` in the dtype of ``query``; zeros for a target with no pair.
+
+    Raises:
+        ShapeError: the numbers of targets or sources are not those of ``pairs``.
+    """
+    if len(pairs) == 1:
+        ((key, value),) = keys_and_values
+        return ray_attention(query, key, value, pairs[0], direction)
+    dtype = torch.promote_types(query.dtype, torch.float32)
+    mean = torch.zeros(query.shape, dtype=dtype, device=query.device)
+    log_weight = query.new_full(query.shape[:2], -torch.inf, dtype=dtype)
+    with torch.no_grad():
+        for (key, value), of_chunk in zip(keys_and_values, pairs, strict=True):
+            chunk_mean, chunk_log_weight = ray_attention_with_sum(query, key, value, of_chunk, direction)
+            joint = torch.logaddexp(log_weight, chunk_log_weight)
+            # A target without a source so far: -inf minus -inf is no number, its share of nothing is zero.
+            share = torch.nan_to_num((chunk_log_weight - joint).exp_())[..., None]
+            mean.lerp_(chunk_mean.to(dtype), share)
+            log_weight = joint
+    return mean.to(query.dtype)
+
+
 def ray_attention_with_sum(
     query: Tensor,
     key: Tensor,
     value: Tensor,
-    pairs: PairList | BlockPairs,
+    pairs: Pairs,
     direction: Direction = "pixels_to_voxels",
 ) -> tuple[Tensor, Tensor]:
     """Return ``ray_attention`` and the weight of each result beside those over other sources.
@@ -74,7 +118,7 @@ def ray_attention_with_sum(
 
 
 def _attend(
-    query: Tensor, key: Tensor, value: Tensor, pairs: PairList | BlockPairs, direction: Direction
+    query: Tensor, key: Tensor, value: Tensor, pairs: Pairs, direction: Direction
 ) -> tuple[Tensor, Tensor, bool]:
     """Return the result, its log-sum-exp as the implementation gives it, and whether that is to base 2."""
     if direction not in ("pixels_to_voxels", "voxels_to_pixels"):

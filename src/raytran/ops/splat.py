@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from raytran.errors import check_shape
-from raytran.ops.pairs import PairList, PairOrder
-from raytran.ops.segment import sparse_product
-from raytran.ops.triton.block_pairs import BlockPairs
+from raytran.ops.pairs import PairOrder
+from raytran.ops.ray_attention import Pairs
+from raytran.ops.sparse import sparse_product
 from raytran.ops.triton.dispatch import fused_blocks, listed
 
 
-def splat_features(features: Tensor, pairs: PairList | BlockPairs) -> tuple[Tensor, Tensor]:
+def splat_features(features: Tensor, pairs: Pairs) -> tuple[Tensor, Tensor]:
     """Average over each voxel the features of the pixels paired with it.
 
     Half-precision input is summed in float32.
@@ -26,8 +26,8 @@ def splat_features(features: Tensor, pairs: PairList | BlockPairs) -> tuple[Tens
         pairs: which pixel sees which voxel.
 
     Returns:
-        ``(num_voxels, C)`` in the dtype of ``features``, zeros for a voxel with no pair; and ``seen``
-        ``(num_voxels,)`` bool, whether it has one.
+        ``(num_voxels, C)`` in the dtype of ``features``, zeros for a voxel with no pair; and whether it has
+        one, ``(num_voxels,)`` bool.
 
     Raises:
         ShapeError: the number of pixels is not that of ``pairs``.
@@ -49,6 +49,31 @@ def splat_features(features: Tensor, pairs: PairList | BlockPairs) -> tuple[Tens
     with torch.autocast(features.device.type, enabled=False):
         mean = _mean(features.to(dtype), list(by_voxel), list(by_pixel))
     return mean.to(features.dtype), by_voxel.row_offsets.diff() > 0
+
+
+def splat_in_chunks(features: Sequence[Tensor], pairs: Sequence[Pairs]) -> tuple[Tensor, Tensor]:
+    """Return ``splat_features`` of pixels that come in chunks; several chunks have no gradient.
+
+    Args:
+        features: of each chunk of pixels ``(num_pixels, C)``.
+        pairs: of each chunk, with the same voxels.
+
+    Raises:
+        ShapeError: a number of pixels is not that of its ``pairs``.
+    """
+    if len(features) == 1:
+        return splat_features(features[0], pairs[0])
+    dtype = torch.promote_types(features[0].dtype, torch.float32)
+    total = features[0].new_zeros((pairs[0].num_voxels, features[0].shape[1]), dtype=dtype)
+    count = total.new_zeros(len(total), dtype=torch.int64)
+    with torch.no_grad():
+        for chunk, of_chunk in zip(features, pairs, strict=True):
+            mean, _ = splat_features(chunk, of_chunk)
+            pixels_per_voxel = of_chunk.pixels_per_voxel()
+            total += mean.to(dtype) * pixels_per_voxel[:, None]
+            count += pixels_per_voxel
+    mean = total / count.clamp(min=1)[:, None]
+    return mean.to(features[0].dtype), count > 0
 
 
 @torch.library.custom_op("raytran::pair_mean", mutates_args=())

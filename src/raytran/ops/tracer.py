@@ -4,17 +4,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import get_args
+from typing import Literal, get_args
 
 import torch
 
 from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.ops.pairs import PairList
+from raytran.ops.ray_attention import Pairs
 from raytran.ops.traverse import trace_pairs
-from raytran.ops.triton.block_pairs import BlockPairs
-from raytran.ops.triton.dispatch import Attention, interpreted, why_no_kernels
+from raytran.ops.triton.dispatch import interpreted, why_no_kernels
+
+Attention = Literal["auto", "fused", "sparse"]
+"""By what ray-traced attention is computed: fused kernels where they run, fused kernels, or torch.sparse."""
 
 
 class RayTracer:
@@ -38,13 +40,13 @@ class RayTracer:
     @torch.compiler.disable
     def __call__(
         self, cameras: Cameras, grid: VoxelGrid, feature_size: tuple[int, int], rays_per_cell: int
-    ) -> PairList | BlockPairs:
+    ) -> Pairs:
         """Return the pairs of ``trace_pairs``, with both orders made; arguments and errors are its own.
 
         Raises:
             ConfigError: ``attention`` is ``fused`` and the fused kernels do not run here.
         """
-        pairs: PairList | BlockPairs
+        pairs: Pairs
         if self._is_fused(cameras.intrinsics.device):
             # CPU installations of torch lack Triton: its module is imported only where it runs.
             from raytran.ops.triton.traverse import trace_blocks

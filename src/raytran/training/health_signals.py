@@ -11,7 +11,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
-from raytran.losses.matcher import HungarianMatcher, Match
+from raytran.losses.matcher import HungarianMatcher
+from raytran.losses.objects import Match
 from raytran.structs import PADDING, ObjectSet, RawObjects, RawScene
 from raytran.training.ranks import mean_over_ranks
 

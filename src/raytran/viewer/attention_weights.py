@@ -8,7 +8,7 @@ from torch import Tensor
 
 from raytran.errors import check_shape
 from raytran.ops.pairs import PairList
-from raytran.ops.segment import row_of_pair, sampled_product, segment_max, segment_sum
+from raytran.ops.sparse import row_of_pair, sampled_product, segment_max, segment_sum
 
 
 @torch.no_grad()

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from raytran.ops.pairs import PairList
-from raytran.ops.segment import row_of_pair, segment_max
+from raytran.ops.sparse import row_of_pair, segment_max
 
 MAX_PAIRS = 8_000_000
 """Pairs that are kept of a volume: about 8 MB of weights and 3 MB of places."""

@@ -76,7 +76,7 @@ def test_every_part_costs_something(counted: dict[str, Work]) -> None:
 
 
 def test_the_convolutions_of_the_baseline_by_hand() -> None:
-    model = build_model(compose("train", ["preset=tiny", "model=unprojection", "output_dir=x"]))
+    model = build_model(compose("train", ["preset=tiny", "model/backbone=unprojection", "output_dir=x"]))
     load = Load(2, 6, (96, 128), pairs_per_pixel=30.0, fused=False)
     with FakeTensorMode():
         network = fake_copy(model).eval().requires_grad_(False)

@@ -73,7 +73,7 @@ def test_a_plan(caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[
 
 def test_a_plan_without_attention_has_no_blocks_to_compute_twice() -> None:
     small = ["model.grid.resolution=[12,12,6]", "data.views=4", "views.image_size=[64,96]"]
-    needs = plan(compose("plan", [*FAST, "gpu=16GB", "model=unprojection", *small]))
+    needs = plan(compose("plan", [*FAST, "gpu=16GB", "model/backbone=unprojection", *small]))
     assert [x.setting for x in needs if x.job == "train"] == ["everything kept"]
     assert min(x.memory for x in needs) > 0
 

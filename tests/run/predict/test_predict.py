@@ -34,7 +34,7 @@ class Oracle(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.weight = nn.Parameter(torch.zeros(1))
-        self.backbone = SimpleNamespace(resnet=SimpleNamespace(input_channels=3))
+        self.backbone = SimpleNamespace(encoder=SimpleNamespace(input_channels=3))
         self.seen: Views | None = None
 
     def predict(
@@ -270,7 +270,7 @@ def test_mistakes_are_one_sentence_and_leave_nothing(scene, oracle, tmp_path, ch
 
 
 def test_a_network_that_wants_masks_is_for_evaluate(scene, oracle, tmp_path):
-    oracle.backbone.resnet.input_channels = 4
+    oracle.backbone.encoder.input_channels = 4
     with pytest.raises(ConfigError, match=r"a\.ckpt was trained with the true masks .* raytran\.evaluate"):
         module.predict(config(scene, tmp_path / "out"))
     assert not (tmp_path / "out").exists()

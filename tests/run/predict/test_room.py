@@ -36,7 +36,7 @@ class Knowing(nn.Module):
     def __init__(self, truth: ObjectSet, jitter: float = 0.05) -> None:
         super().__init__()
         self.weight = nn.Parameter(torch.zeros(1))
-        self.backbone = SimpleNamespace(resnet=SimpleNamespace(input_channels=3))
+        self.backbone = SimpleNamespace(encoder=SimpleNamespace(input_channels=3))
         self.truth, self.jitter = truth, jitter
         self.generator = torch.Generator().manual_seed(0)
         self.centers: list[torch.Tensor | None] = []

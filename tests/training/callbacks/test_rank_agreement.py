@@ -28,7 +28,7 @@ def test_ranks_that_differ_stop(moment, make_module, monkeypatch):
     with pytest.raises(RaytranError, match="networks differ at step 7: continue from an earlier checkpoint"):
         getattr(RankAgreement(), moment)(trainer, module)
     assert len(compared) == len([*module.parameters(), *module.buffers()])
-    norm = module.model.backbone.resnet.bn1
+    norm = module.model.backbone.encoder.bn1
     assert any(tensor is norm.running_var for tensor in compared)
     assert any(tensor is norm.weight for tensor in compared)
 

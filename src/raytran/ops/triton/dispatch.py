@@ -7,15 +7,11 @@ import logging
 import os
 from functools import cache
 from importlib.util import find_spec
-from typing import Literal
 
 import torch
 
 from raytran.ops.pairs import PairList
 from raytran.ops.triton.block_pairs import BlockPairs, kept
-
-Attention = Literal["auto", "fused", "sparse"]
-"""By what ray-traced attention is computed: fused kernels where they run, fused kernels, or torch.sparse."""
 
 MOST_CHANNELS = {torch.float16: 128, torch.bfloat16: 128, torch.float32: 64}
 """Channels of a head up to which the fused kernels fit into a GPU's registers, by the dtype of the inputs."""

@@ -132,7 +132,7 @@ def _make_data_fit(
     cfg.model.grid_resolution, cfg.model.grid_extent = list(model.grid_resolution), list(model.grid_extent)
     # One that was trained with true masks as a fourth channel gets the same here, unless another is typed.
     mask = cfg.data.dataset.input_mask or settings.input_mask or "amodal"
-    cfg.data.dataset.input_mask = mask if model.backbone.resnet.input_channels == 4 else None
+    cfg.data.dataset.input_mask = mask if model.backbone.encoder.input_channels == 4 else None
 
 
 def with_at_most(max_objects: int | None, dataset: Any) -> Dataset[SceneBatch]:

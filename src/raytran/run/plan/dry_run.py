@@ -24,8 +24,8 @@ from torch.utils._pytree import tree_leaves
 
 import raytran.backbone.block
 import raytran.backbone.chunked
-import raytran.backbone.lifting
-import raytran.ops.center_tracer
+import raytran.backbone.image_features
+import raytran.extensions.unprojection
 import raytran.ops.tracer
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
@@ -121,9 +121,9 @@ def stand_ins(pairs_per_pixel: float, *, fused: bool) -> Iterator[None]:
 
     replaced = {
         raytran.ops.tracer: (trace_pairs,),
-        raytran.ops.center_tracer: (pair_centers,),
+        raytran.extensions.unprojection: (pair_centers,),
         raytran.backbone.block: (ray_attention,),
-        raytran.backbone.lifting: (splat_features,),
+        raytran.backbone.image_features: (splat_features,),
         raytran.backbone.chunked: (ray_attention, splat_features, ray_attention_with_sum),
     }
     real = [(module, f.__name__, getattr(module, f.__name__)) for module, fs in replaced.items() for f in fs]

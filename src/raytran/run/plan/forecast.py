@@ -12,9 +12,7 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from raytran.geometry.camera import Cameras
-from raytran.losses.foreground import foreground_loss
-from raytran.losses.occupancy import occupancy_loss
-from raytran.losses.view import view_loss
+from raytran.losses.terms import foreground_loss, occupancy_loss, view_loss
 from raytran.model import SHAPES_AT_ONCE, RayTran
 from raytran.ops.pairs import PairList
 from raytran.run.plan.count import Work, count_part
@@ -73,7 +71,7 @@ def training_bytes(model: RayTran, load: Load, stage: Stage, *, precision: str =
         memory.track(list(network.parameters()))
         trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
         moments = [torch.empty_like(parameter) for parameter in trained for _ in range(2)]
-        views = load.fake_views(network.backbone.resnet.input_channels)
+        views = load.fake_views(network.backbone.encoder.input_channels)
         new_views = replace(load, views=stage.new_views).fake_views(3)
         with stand_ins(load.pairs_per_pixel, fused=load.fused):
             with _precision(precision):
@@ -93,7 +91,7 @@ def prediction_bytes(
     def run(memory: LiveMemory) -> None:
         network = fake_copy(model).eval()
         memory.track(list(network.parameters()))
-        views = load.fake_views(network.backbone.resnet.input_channels)
+        views = load.fake_views(network.backbone.encoder.input_channels)
         with stand_ins(load.pairs_per_pixel, fused=load.fused), _precision(precision), torch.no_grad():
             raw = network(views, views_at_once=views_at_once)
             masks = [logits.float().sigmoid() for logits in (raw.occupancy, raw.foreground)]
@@ -119,7 +117,7 @@ def work_of_parts(
     found: dict[str, Work] = {}
     with FakeTensorMode(), _precision(precision):
         network = fake_copy(model).train(training).requires_grad_(training)
-        views, pairs = load.fake_views(network.backbone.resnet.input_channels), load.fake_pairs(network)
+        views, pairs = load.fake_views(network.backbone.encoder.input_channels), load.fake_pairs(network)
         parts = step_parts(network, views, pairs, **({} if stage is None else {"tasks": stage.tasks}))
         size = 4 if _AUTOCAST[precision] is None else 2
         for part in parts:

@@ -147,7 +147,7 @@ def _read(cfg: DictConfig, world: WorldSettings, settings: PredictionSettings, m
 
 def _check_channels(model: RayTran, checkpoint: str) -> None:
     """Raise if the network wants masks beside the images."""
-    if model.backbone.resnet.input_channels != RGB:
+    if model.backbone.encoder.input_channels != RGB:
         raise ConfigError(
             f"{checkpoint} was trained with the true masks as a fourth channel, which only annotated scenes "
             "have: use it with python -m raytran.evaluate, or give a checkpoint that was trained without"

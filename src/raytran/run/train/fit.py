@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 RANDOM_ENCODER = (
-    "IMAGE ENCODER STARTS FROM RANDOM WEIGHTS: model.backbone.resnet.weights=auto found no ImageNet weights"
+    "IMAGE ENCODER STARTS FROM RANDOM WEIGHTS: model.backbone.encoder.weights=auto found no ImageNet weights"
 )
 """In every checkpoint that comes of such a start, those of later stages included."""
 
@@ -202,7 +202,7 @@ def _start(cfg: DictConfig, run: RunConfig) -> _Start:
 def _warnings(model: RayTran) -> list[str]:
     """Return what is to be known of the weights that a network starts from without any parent."""
     # An encoder of the user's own need not tell.
-    return [RANDOM_ENCODER] if getattr(model.backbone.resnet, "random_fallback", False) else []
+    return [RANDOM_ENCODER] if getattr(model.backbone.encoder, "random_fallback", False) else []
 
 
 def _to_continue(run: RunConfig) -> tuple[Path, dict[str, Any]] | None:
