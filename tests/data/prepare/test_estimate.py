@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import pytest
 
-from raytran.data.atomic import bytes_below
+from raytran.data.files import bytes_below
 from raytran.data.prepare.estimate import Estimate, estimate
 from raytran.data.prepare.settings import PrepareSettings
 from raytran.data.prepare.sources import Released, read_sources

@@ -139,7 +139,7 @@ def test_a_broken_off_run_is_finished_and_nothing_done_twice(released, prepare, 
     shutil.rmtree(out / "scannet/scans/scene0001_00")
     for name in ("scannet/scans/.unfinished-x.1/x/color", "shapenet/03001627/.unfinished-abc/models"):
         (out / name).mkdir(parents=True)
-    for name in (".unfinished-report.json.1", "cache/shape/aa/key-1.tmp"):
+    for name in (".unfinished-report.json.1", "cache/shape/aa/.unfinished-1-key"):
         (out / name).parent.mkdir(parents=True, exist_ok=True)
         (out / name).write_text("half")
     (out / "report.json").unlink()

@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from statistics import fmean, median
 
-from raytran.data.atomic import UNFINISHED, bytes_below
+from raytran.data.files import UNFINISHED, bytes_below
 from raytran.data.prepare.annotation import used_models, without_models
 from raytran.data.prepare.frames import choose_frames, encoded_frame
 from raytran.data.prepare.models import prepare_model

@@ -9,8 +9,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from raytran.data.atomic import UNFINISHED, sweep
 from raytran.data.cache import file_digest
+from raytran.data.files import UNFINISHED, sweep
 from raytran.data.prepare.report_text import report_text
 from raytran.data.prepare.scan import check_room
 from raytran.data.prepare.settings import PrepareSettings, claimed
@@ -28,7 +28,7 @@ _UNFINISHED = (
     f"scan2cad/{UNFINISHED}*",
     f"shapenet/*/{UNFINISHED}*",
     f"shapenet/*/*/{UNFINISHED}*",
-    "cache/*/*/*.tmp",
+    f"cache/*/*/{UNFINISHED}*",
 )
 """Where processes that were killed leave temporary files."""
 

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from raytran.data.atomic import bytes_below
+from raytran.data.files import bytes_below
 from raytran.data.prepare.annotation import Annotations, Entry, LeftOut
 from raytran.data.prepare.scan import read_facts
 from raytran.data.prepare.sources import Sources

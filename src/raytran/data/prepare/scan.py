@@ -10,8 +10,8 @@ from typing import Any
 
 import torch
 
-from raytran.data.atomic import finished_folder, no_room, write_json
 from raytran.data.cache import MaskCache
+from raytran.data.files import disk_full, finished_folder, write_json
 from raytran.data.images import MIN_VIEWS
 from raytran.data.prepare.annotation import Entry
 from raytran.data.prepare.frames import homogeneous, matrix_text, write_frames
@@ -103,7 +103,7 @@ def check_room(error: BaseException, output: Path) -> None:
     Raises:
         DataError: it does.
     """
-    cause = no_room(error)
+    cause = disk_full(error)
     if cause is not None:
         raise DataError(
             f"cannot go on writing to {output} ({cause.strerror}): make room there and give the same command "

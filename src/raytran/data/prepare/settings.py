@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
-from raytran.data.atomic import write_json
+from raytran.data.files import SettingsRecord, exclusive_lock
 from raytran.errors import ConfigError, DataError
 
 FORMAT = "raytran.prepared/1"
@@ -54,38 +53,18 @@ def claimed(output: Path, settings: PrepareSettings, sources: dict[str, Any]) ->
     Raises:
         DataError: it was begun otherwise, holds other things, or another process works on it.
     """
-    path = output / MARKER
-    asked = json.loads(json.dumps({"format": FORMAT, **asdict(settings), **sources}))
-    if not path.exists():
-        if output.exists() and any(not found.name.startswith(".") for found in output.iterdir()):
-            raise DataError(
-                f"{output} holds other things than prepared data: choose a folder that does not exist yet"
-            )
-        write_json(path, asked)
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError:
-        found = {}
-    if different := [key for key in asked if found.get(key) != asked[key]]:
+    record = SettingsRecord(output / MARKER)
+    is_new = not record.path.exists() and output.exists()
+    if is_new and any(not entry.name.startswith(".") for entry in output.iterdir()):
         raise DataError(
-            f"{path} says that the folder was begun with another {', '.join(different)}; "
+            f"{output} holds other things than prepared data: choose a folder that does not exist yet"
+        )
+    different = record.begin({"format": FORMAT, **asdict(settings), **sources})
+    if different:
+        raise DataError(
+            f"{record.path} says that the folder was begun with another {', '.join(different)}; "
             "choose another output folder or remove this one"
         )
-    with path.open(encoding="utf-8") as file:
-        _lock(file, output)
+    busy = DataError(f"another process prepares {output}: wait for it to end, or choose another folder")
+    with exclusive_lock(record.path, if_taken=busy):
         yield
-
-
-def _lock(file: TextIO, output: Path) -> None:
-    """Lock ``file`` until it is closed; where that cannot be done it is for the user not to start two."""
-    try:
-        import fcntl
-
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise DataError(
-            f"another process prepares {output}: wait for it to end, or choose another folder"
-        ) from error
-    except (ImportError, OSError):
-        # Windows, and some network disks.
-        return

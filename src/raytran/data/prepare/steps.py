@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from raytran.data.atomic import write_json, write_text
+from raytran.data.files import write_json, write_text
 from raytran.data.prepare.annotation import ANNOTATIONS, Entry, used_models, without_models
 from raytran.data.prepare.estimate import estimate
 from raytran.data.prepare.models import prepare_model

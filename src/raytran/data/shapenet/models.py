@@ -22,7 +22,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from raytran.data.atomic import finished_folder
+from raytran.data.files import finished_folder
 from raytran.data.shapenet.binvox import read_binvox, write_binvox
 from raytran.data.shapenet.obj import read_obj, replaced_obj
 from raytran.errors import DataError
