@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from raytran.data.files import write_json
-from raytran.data.shapenet.colors import read_face_colors
+from raytran.data.shapenet.meshes import read_face_colors
 from raytran.data.shapenet.models import mesh_path, model_names, read_mesh
 from raytran.data.workers import work_on
 from raytran.errors import DataError

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from raytran.data.files import finished_folder
-from raytran.data.shapenet.binvox import write_binvox
+from raytran.data.shapenet.meshes import write_binvox
 from raytran.data.shapenet.models import STEM
 from raytran.data.shapenet.voxelize import scan_convert
 
