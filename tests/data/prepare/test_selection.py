@@ -7,7 +7,7 @@ import pytest
 
 from raytran.data.prepare.annotation import Annotations
 from raytran.data.prepare.selection import select_scans
-from raytran.data.scannet.sources import ScanSource
+from raytran.data.scannet.find import ScanSource
 from raytran.errors import ConfigError, DataError
 
 ROOT = Path("/scannet")

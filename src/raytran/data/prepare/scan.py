@@ -17,8 +17,8 @@ from raytran.data.prepare.annotation import Entry
 from raytran.data.prepare.frames import homogeneous, matrix_text, write_frames
 from raytran.data.prepare.settings import PrepareSettings
 from raytran.data.scan2cad import parse_entry, scene_objects
+from raytran.data.scannet.find import ScanSource
 from raytran.data.scannet.scan import read_scan
-from raytran.data.scannet.sources import ScanSource
 from raytran.data.targets import foreground_masks
 from raytran.errors import DataError
 from raytran.geometry.camera import Cameras

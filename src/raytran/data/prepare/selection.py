@@ -10,7 +10,7 @@ from pathlib import Path
 
 from raytran.data.prepare.annotation import Annotations, Entry
 from raytran.data.prepare.scan import ScanJob
-from raytran.data.scannet.sources import SPLITS, ScanSource
+from raytran.data.scannet.find import SPLITS, ScanSource
 from raytran.errors import ConfigError, DataError
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from raytran.data.prepare.annotation import Annotations, find_annotations, read_usable
 from raytran.data.prepare.selection import Selection, select_scans
-from raytran.data.scannet.sources import ScanSource, find_scans, read_splits
+from raytran.data.scannet.find import ScanSource, find_scans, read_splits
 from raytran.data.shapenet.models import Version, shapenet_version
 from raytran.errors import ConfigError
 

@@ -2,10 +2,10 @@
 """The files of a CAD model: its mesh (OBJ), the colours of its faces (MTL) and its voxels (binvox).
 
 These are our own readers, because ShapeNet's boxes and origins count the vertices of a file as they are, and
-because files from anywhere are read. trimesh splits vertices where normals or textures differ, groups faces by
-material, counts negative indices from the end of the file, reads a damaged OBJ as an empty mesh, opens every
-texture that an MTL names, and takes a missing scale of voxels as 1. Every reader here limits the memory that
-a file can claim.
+because a file may come from anywhere: every reader limits the memory that a file can claim. trimesh splits
+vertices where normals or textures differ, groups faces by material, counts negative indices from the end of
+the file, reads a damaged OBJ as an empty mesh, opens every texture that an MTL names, and takes a missing
+scale of voxels as 1.
 """
 
 from __future__ import annotations
