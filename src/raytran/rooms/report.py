@@ -11,7 +11,7 @@ import trimesh
 from PIL import Image
 
 from raytran.data.files import whole_file, write_json, write_text
-from raytran.data.prepare.report_text import class_table
+from raytran.data.prepare.report import class_table
 from raytran.data.scan2cad import SceneAnnotation, read_annotations, scene_objects
 from raytran.data.scannet.scan import read_scan
 from raytran.data.targets import object_meshes

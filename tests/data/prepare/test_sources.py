@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from raytran.data.prepare.annotation import Annotations
-from raytran.data.prepare.selection import select_scans
+from raytran.data.prepare.sources import select_scans
 from raytran.data.scannet.find import ScanSource
 from raytran.errors import ConfigError, DataError
 
