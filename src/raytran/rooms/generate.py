@@ -18,8 +18,15 @@ import numpy as np
 from raytran.data.files import UNFINISHED, SettingsRecord, sweep, write_text
 from raytran.data.workers import work_on
 from raytran.errors import ConfigError, DataError
-from raytran.rooms.library import digest_of, list_models, read_library, survey, write_library
-from raytran.rooms.pool import MODELS_PER_CLASS, ModelPool
+from raytran.rooms.library import (
+    MODELS_PER_CLASS,
+    ModelPool,
+    digest_of,
+    list_models,
+    read_library,
+    survey,
+    write_library,
+)
 from raytran.rooms.scene import RoomSettings, make_scene
 from raytran.rooms.write import annotation_path, write_scene
 

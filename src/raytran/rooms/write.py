@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from raytran.data.files import finished_folder, write_text
 from raytran.data.shapenet.models import copy_model
-from raytran.rooms.placed import PlacedObject
+from raytran.rooms.objects import PlacedObject
 from raytran.rooms.scene import Scene
 from raytran.rooms.shapenet_files import write_model
 
