@@ -26,7 +26,8 @@ from raytran.data.augment import Augmentation
 from raytran.data.cache import MaskCache
 from raytran.data.collate import collate_scenes
 from raytran.data.dataset import SceneDataset, scan2cad_dataset
-from raytran.data.scannet.scan import read_scan, scan_views
+from raytran.data.scan import scan_views
+from raytran.data.scannet.scan import read_scan
 from raytran.data.targets import foreground_masks, scene_occupancy, shape_grids
 from raytran.data.views import choose_even
 from raytran.geometry.camera import Cameras

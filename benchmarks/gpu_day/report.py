@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from gpu_day.checks import Check
-from raytran.data.atomic import write_json, write_text
+from raytran.data.files import write_json, write_text
 
 _LINE = ("gpu", "driver", "torch", "triton", "cudnn", "nccl", "processor", "cores", "date", "commit")
 

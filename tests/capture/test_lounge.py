@@ -12,7 +12,8 @@ import torch
 
 from raytran.capture.open import open_scene
 from raytran.capture.orient import WorldSettings
-from raytran.data.scannet.scan import even_views, read_scan
+from raytran.data.scan import even_views
+from raytran.data.scannet.scan import read_scan
 from raytran.run.entry import compose
 from raytran.run.train.build import build_model
 

@@ -16,7 +16,7 @@ from torch.utils.data import DataLoader
 from raytran.data import dataset as dataset_module
 from raytran.data.augment import Augmentation
 from raytran.data.collate import collate_scenes
-from raytran.data.dataset import SceneDataset, scan2cad_dataset
+from raytran.data.dataset import FewScenes, SceneDataset, few_scenes, scan2cad_dataset
 from raytran.data.scannet.scan import load_views
 from raytran.errors import ConfigError, DataError
 from raytran.geometry.rotation import yaw_from_rotation
@@ -365,3 +365,26 @@ def test_frames_to_render_change_with_the_epoch_and_with_the_scene(long_dataset)
 def test_too_few_frames_to_hold_some_out(cube_dataset) -> None:
     with pytest.raises(DataError, match="can be read and 6 are needed"):
         open_dataset(cube_dataset, num_views=4, num_new_views=4, targets=())[0]
+
+
+def test_the_first_scenes_and_no_more():
+    few = FewScenes(["a", "b", "c"], 2)
+    assert (len(few), few[0], few[1]) == (2, "a", "b")
+    with pytest.raises(IndexError):
+        few[2]
+    assert len(FewScenes(["a"], 5)) == 1
+
+
+def test_the_same_frames_in_every_epoch_and_in_validation(cube_dataset):
+    asked = {"root": cube_dataset, "cache_dir": cube_dataset / "cache", "num_scenes": 1, **SMALL}
+    training = few_scenes(split="train", view_choice="random", **asked)
+    first = training[0]
+    validation = few_scenes(split="val", view_choice="even", **asked)
+    for other in (training[7, 0], validation[0]):
+        assert other.frame_id == first.frame_id == (("10", "100"),)
+        assert torch.equal(other.views.images, first.views.images)
+
+
+def test_objects_are_counted_without_reading_the_scene(cube_dataset):
+    dataset = scan2cad_dataset(cube_dataset, "train", cache_dir=cube_dataset / "cache", **SMALL)
+    assert [dataset.num_objects(index) for index in range(len(dataset))] == [len(dataset[0].objects[0])]

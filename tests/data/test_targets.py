@@ -18,7 +18,7 @@ from raytran.data import targets
 from raytran.data.cache import MaskCache
 from raytran.data.scan2cad import read_annotations, scene_objects
 from raytran.data.scannet.scan import read_scan
-from raytran.data.shapenet.binvox import read_binvox
+from raytran.data.shapenet.meshes import read_binvox
 from raytran.data.shapenet.models import read_mesh
 from raytran.data.shapenet.voxelize import voxelize_solid
 from raytran.data.targets import foreground_masks, scene_occupancy, shape_grids

@@ -13,8 +13,8 @@ from raytran.errors import ConfigError, DataError
 from raytran.rooms import benchmark
 from raytran.rooms.benchmark import generate_rooms_v1, generate_rooms_v1_furniture
 from raytran.rooms.generate import generate_rooms
+from raytran.rooms.library import ModelPool
 from raytran.rooms.materials import texture_library
-from raytran.rooms.pool import ModelPool
 from raytran.run.entry import compose
 
 HOW = {"processes": 1, "progress": False}

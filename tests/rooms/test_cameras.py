@@ -6,7 +6,7 @@ import pytest
 
 from raytran.geometry.camera import pose_from_heading
 from raytran.rooms.cameras import CLEARANCE, make_intrinsics
-from raytran.rooms.collision import Boxes
+from raytran.rooms.objects import Boxes
 
 
 def test_intrinsics_have_the_sensors_field_of_view():

@@ -9,8 +9,8 @@ import pytest
 
 from raytran.rooms.furnish import Furnisher
 from raytran.rooms.layout import Layout
-from raytran.rooms.placed import FLOOR
-from raytran.rooms.pool import ModelPool
+from raytran.rooms.library import ModelPool
+from raytran.rooms.objects import FLOOR
 from raytran.rooms.room import make_room
 from raytran.structs import CLASSES
 

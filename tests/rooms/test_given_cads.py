@@ -15,8 +15,7 @@ from raytran.data.shapenet.models import has_model
 from raytran.errors import DataError
 from raytran.rooms.cad import RECIPES, finish_model
 from raytran.rooms.generate import generate_rooms
-from raytran.rooms.library import read_library
-from raytran.rooms.pool import FEW, ModelPool
+from raytran.rooms.library import FEW, ModelPool, read_library
 from raytran.rooms.shapenet_files import write_model
 
 SMALL = {"frames": 4, "image_size": (48, 64), "max_objects": 8, "progress": False, "seed": 3, "processes": 1}

@@ -7,8 +7,8 @@ import torch
 
 from raytran.geometry.boxes import OrientedBoxes, box_iou
 from raytran.rooms.layout import MAX_TILT, Layout
-from raytran.rooms.placed import FLOOR, upright_rotation, yaw_facing
-from raytran.rooms.pool import ModelPool
+from raytran.rooms.library import ModelPool
+from raytran.rooms.objects import FLOOR, upright_rotation, yaw_facing
 from raytran.rooms.room import make_room
 
 

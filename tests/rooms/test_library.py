@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from raytran.errors import DataError
-from raytran.rooms.cad import CATEGORY_IDS, sample_model
-from raytran.rooms.kinds import KINDS
+from raytran.rooms.cad import sample_model
+from raytran.rooms.kinds import CATID_BY_CLASS, KINDS
 from raytran.rooms.library import list_models, read_library, survey, write_library
 from raytran.rooms.shapenet_files import write_model
 
 QUIET = {"processes": 1, "progress": False}
-CHAIR = CATEGORY_IDS["chair"]
+CHAIR = CATID_BY_CLASS["chair"]
 
 
 @pytest.fixture(scope="module")

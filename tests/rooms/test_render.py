@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from raytran.geometry.camera import Cameras, pose_from_heading
+from raytran.rooms.materials import Paint, Surfaces, box_triangles, quad_triangles
 from raytran.rooms.render import Pinhole, Renderer
 from raytran.rooms.room import Light
-from raytran.rooms.surfaces import Paint, Surfaces, box_triangles, quad_triangles
 
 GREY = Paint(dark=(0.5, 0.5, 0.5), light=(0.5, 0.5, 0.5))
 RED = Paint(dark=(1.0, 0.0, 0.0), light=(1.0, 0.0, 0.0))

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from raytran.data.shapenet.binvox import read_binvox
+from raytran.data.shapenet.meshes import read_binvox
 from raytran.data.shapenet.models import read_mesh
 from raytran.rooms.cad import CadModel, sample_model
 from raytran.rooms.shapenet_files import write_model

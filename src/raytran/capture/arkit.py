@@ -19,7 +19,7 @@ from raytran.capture.json_file import number, numbers, read_object
 from raytran.capture.lens import Lens, check_lens
 from raytran.capture.trajectory import Track, poses_at, read_table
 from raytran.data.images import stored_size
-from raytran.data.scannet.scan import NO_IMAGE, NO_POSE, numbers_first
+from raytran.data.scan import NO_IMAGE, NO_POSE, numbers_first
 from raytran.errors import DataError
 
 _TRACKS = {

@@ -17,13 +17,12 @@ from numpy.typing import NDArray
 from raytran.capture.lens import Lens, check_lens, needs_resampling, resample, shared_pinhole
 from raytran.capture.orient import Axes
 from raytran.data.images import decode_image, stored_size
-from raytran.data.scan import OpenScan
-from raytran.data.scannet.scan import LOST, NO_IMAGE, NO_POSE, numbers_first
+from raytran.data.scan import LOST, NO_IMAGE, NO_POSE, OpenScan, numbers_first
 from raytran.data.scannet.text import are_rigid
 from raytran.errors import DataError
 
 UNREADABLE = "image cannot be read"
-"""Reason for which a frame is dropped, beside those of ``raytran.data.scannet.scan``."""
+"""Reason for which a frame is dropped, beside those of ``raytran.data.scan``."""
 
 IMAGE_ENDINGS = (".jpg", ".jpeg", ".png")
 

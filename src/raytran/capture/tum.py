@@ -20,7 +20,7 @@ from raytran.capture.trajectory import (
     read_track,
 )
 from raytran.data.images import stored_size
-from raytran.data.scannet.scan import NO_POSE
+from raytran.data.scan import NO_POSE
 from raytran.errors import DataError
 
 _IMAGE_FOLDERS = ("rgb", "images", "color", "image", "frames", ".")

@@ -22,7 +22,7 @@ from raytran.capture.trajectory import (
     read_track,
 )
 from raytran.data.images import MAX_SIDE, resize
-from raytran.data.scannet.scan import NO_POSE
+from raytran.data.scan import NO_POSE
 from raytran.errors import ConfigError, DataError
 
 VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")

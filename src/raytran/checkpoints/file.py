@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import pickle
@@ -16,6 +15,7 @@ import torch
 from raytran.checkpoints.content import EARLIER_FORMAT, FORMAT, DamagedCheckpointError, check_content
 from raytran.checkpoints.earlier import upgraded
 from raytran.checkpoints.weights_file import is_weights_file, read_weights
+from raytran.data.files import UNFINISHED, whole_file
 from raytran.errors import CheckpointError
 
 _log = logging.getLogger(__name__)
@@ -32,47 +32,39 @@ def write_checkpoint(path: Path, content: dict[str, Any]) -> None:
     Raises:
         CheckpointError: the disk is full or does not take the file; what was there stays.
     """
-    partial = path.with_name(f"{path.name}.part")
+    previous = path.with_name(PREVIOUS_NAME)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("wb") as file:
-            torch.save(content, file)
-            file.flush()
-            os.fsync(file.fileno())
-        _replace(partial, path)
+        with whole_file(path, durable=True) as partial:
+            with partial.open("wb") as file:
+                torch.save(content, file)
+            link = _link_previous(path, previous)
+        if link is not None:
+            os.replace(link, previous)
     except (OSError, RuntimeError) as error:
         # PyTorch turns a failed write into a RuntimeError about its own file position.
         cause = error if isinstance(error, OSError) else error.__context__
         reason = cause.strerror if isinstance(cause, OSError) else "the disk is full or the file too large"
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
         raise CheckpointError(
             f"cannot write {path} ({reason}): make room there; the checkpoint from before is kept"
         ) from error
 
 
-def _replace(partial: Path, path: Path) -> None:
-    """Give ``partial`` the name ``path``, whose file becomes the previous one; both exist throughout."""
-    previous = path.with_name(PREVIOUS_NAME)
-    if path.is_file() and path.name != PREVIOUS_NAME:
-        linked = path.with_name(f"{PREVIOUS_NAME}.part")
-        linked.unlink(missing_ok=True)
-        try:
-            os.link(path, linked)
-        except OSError:
-            os.replace(path, previous)  # a file system without links
-            os.replace(partial, path)
-        else:
-            os.replace(partial, path)
-            os.replace(linked, previous)
-    else:
-        os.replace(partial, path)
-    with contextlib.suppress(OSError):  # not every system lets a folder be opened
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+def _link_previous(path: Path, previous: Path) -> Path | None:
+    """Return a second name of the file at ``path``, which takes the name ``previous`` once ``path`` is new.
+
+    Both ``path`` and ``previous`` so exist throughout. None if there is nothing to keep, or if the file
+    system has no links: then ``path`` has become ``previous`` already.
+    """
+    if not path.is_file() or path == previous:
+        return None
+    link = previous.with_name(f"{UNFINISHED}{previous.name}")
+    link.unlink(missing_ok=True)
+    try:
+        os.link(path, link)
+    except OSError:
+        os.replace(path, previous)
+        return None
+    return link
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

@@ -8,7 +8,6 @@ before it while it goes on and, once its last step is done, ``finished.json``.
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -17,10 +16,8 @@ from pathlib import Path
 from typing import Any
 
 from raytran.checkpoints.launched import name_by_time
-from raytran.data.atomic import write_json
+from raytran.data.files import exclusive_lock, write_json
 from raytran.errors import CheckpointError, ConfigError
-
-_log = logging.getLogger(__name__)
 
 LAST = Path("checkpoints") / "last.ckpt"
 PREVIOUS = LAST.with_name("previous.ckpt")
@@ -61,20 +58,9 @@ def one_at_a_time(folder: Path) -> Iterator[int]:
     Raises:
         ConfigError: one does already.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / _LOCK).open("a") as file:
-        try:
-            import fcntl
-
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise ConfigError(
-                f"another process trains in {folder}: wait for it to end, or stop it, and try again"
-            ) from error
-        except (ImportError, OSError) as error:
-            # Windows, and some network disks: there it is for the user not to start two.
-            _log.debug("cannot lock %s: %s", folder, error)
-        yield file.fileno()
+    busy = ConfigError(f"another process trains in {folder}: wait for it to end, or stop it, and try again")
+    with exclusive_lock(folder / _LOCK, if_taken=busy) as descriptor:
+        yield descriptor
 
 
 def write_finished(

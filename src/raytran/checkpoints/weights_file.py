@@ -8,10 +8,8 @@ text and of the tensors, which safetensors itself does not check.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -22,6 +20,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from raytran.checkpoints.content import DamagedCheckpointError, check_content
+from raytran.data.files import whole_file
 from raytran.errors import CheckpointError
 
 SUFFIX = ".safetensors"
@@ -65,21 +64,13 @@ def write_whole(path: Path, content: bytes) -> None:
     Raises:
         CheckpointError: the disk is full or does not take the file; what was there stays.
     """
-    partial = path.with_name(f"{path.name}.part")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
+        with whole_file(path, durable=True) as partial:
+            partial.write_bytes(content)
     except OSError as error:
         raise CheckpointError(
             f"cannot write {path} ({error.strerror}): make room there, or choose another place"
         ) from error
-    finally:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
 
 
 def read_weights(path: Path) -> dict[str, Any]:

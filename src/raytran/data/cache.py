@@ -5,16 +5,15 @@ from __future__ import annotations
 
 import hashlib
 import math
-import os
 import zlib
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
 
+from raytran.data.files import whole_file
 from raytran.errors import DataError
 
 
@@ -71,15 +70,9 @@ class MaskCache:
         Raises:
             DataError: the folder cannot be written.
         """
-        path = self._path(kind, key)
-        temporary = path.with_name(f"{key}-{uuid4().hex}.tmp")
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            try:
+            with whole_file(self._path(kind, key)) as temporary:
                 temporary.write_bytes(zlib.compress(np.packbits(array).tobytes()))
-                os.replace(temporary, path)
-            finally:
-                temporary.unlink(missing_ok=True)
         except OSError as error:
             raise DataError(
                 f"cannot write to the cache of training targets at {self._folder} ({error.strerror}): "

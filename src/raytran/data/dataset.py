@@ -16,8 +16,9 @@ from torch.utils.data import Dataset
 from raytran.data.augment import Augmentation
 from raytran.data.cache import MaskCache
 from raytran.data.images import MIN_VIEWS
+from raytran.data.scan import scan_views
 from raytran.data.scan2cad import SceneAnnotation, annotation_path, read_annotations, scene_objects
-from raytran.data.scannet.scan import Scan, scan_views
+from raytran.data.scannet.scan import Scan
 from raytran.data.scene_list import ObjectTable, RecentScans, annotated, choose_scenes, read_split
 from raytran.data.targets import (
     foreground_masks,
@@ -41,22 +42,22 @@ INPUT_MASKS = ("amodal", "visible")
 SCAN_MESH = "{}_vh_clean_2.ply"
 """Name of a scan's mesh in ScanNet's release."""
 
-_MEMORY_OF_SCANS = 64 * 2**20
-"""Bytes in which each process keeps cameras and file names: 300,000 frames, all of ScanNet at 200 a scan."""
+_MAX_SCAN_BYTES = 64 * 2**20
+"""Memory of each process for cameras and file names: 300,000 frames, all of ScanNet at 200 a scan."""
 
 _DROPOUT, _AUGMENTATION, _HELD_OUT = 1, 2, 3
-"""What randomness is for, besides the choice of frames."""
+"""Purposes of random numbers, besides the choice of frames."""
 
 
 class _Randomness(NamedTuple):
-    """What the random choices for one scene depend on."""
+    """What the random choices for one scene depend on, and nothing else."""
 
     seed: int
     epoch: int
     scene: int
 
     def generator(self, *purpose: int) -> torch.Generator:
-        """Return a source of random numbers, one for each purpose."""
+        """Return the source of random numbers for a purpose."""
         state = np.random.SeedSequence([*self, *purpose]).generate_state(1, np.uint64)
         return torch.Generator().manual_seed(int(state[0] >> np.uint64(1)))
 
@@ -64,11 +65,11 @@ class _Randomness(NamedTuple):
 class SceneDataset(Dataset[SceneBatch]):
     """Scans with their annotation; item i, or (epoch, i), is a ``SceneBatch`` with B = 1.
 
-    Nothing but the annotation is read before an item is asked for; targets are kept on disk, and in memory
-    the cameras of the latest scans. So a data set is small, stays small, and is quick to send to the workers
-    of a ``DataLoader``. Random frames and augmentation depend on the seed, the epoch and the index alone; the
-    epoch comes with the index, so that workers which are in different epochs do not disturb each other.
-    A scan of fewer than N frames gives some of them more than once, so all scenes have N images.
+    Nothing but the annotation is read before an item is asked for. Targets are cached on disk, the cameras of
+    the latest scans in memory, so the data set stays small and is quick to send to the workers of a
+    ``DataLoader``. Random frames and augmentation depend on the seed, the epoch and the index alone. The
+    epoch comes with the index, because workers may be in different epochs. A scan of fewer than N frames
+    gives some of them more than once, so that every scene has N images.
 
     Args:
         scans_root: folder of the scans, ``…/scannet/scans``.
@@ -76,18 +77,18 @@ class SceneDataset(Dataset[SceneBatch]):
         annotations: Scan2CAD's ``full_annotations.json``, or what ``read_annotations`` made of it; may be
             None if there are no targets.
         shapenet_root: folder of ShapeNet's categories; needed for all targets but "objects".
-        cache_dir: where targets are kept.
+        cache_dir: where targets are cached.
         image_size: ``(H, W)`` to which images are resized, whatever their aspect.
         num_views: N.
-        num_new_views: V, more frames of each scene, given apart as ``new_views``.
+        num_new_views: V, further frames of each scene, given as ``new_views``.
         view_choice: ``"random"`` or ``"even"``.
         grid_resolution: ``(X, Y, Z)`` of the occupancy target.
         grid_extent: sizes of its grid, metres; the grid is centred on the mean of the cameras.
         targets: some of ``TARGETS``.
         object_choice: which annotated objects are the targets "objects" and "shapes": ``"all"`` of the scan;
             ``"in_volume"``, those whose box centre lies in the voxel grid, after augmentation; or ``"seen"``,
-            those that a frame which is given sees (``seen_objects``). Other targets are always of all.
-        input_mask: mask of all objects that is given as a fourth channel of the images: None, ``"amodal"``
+            those that one of the N frames sees (``seen_objects``). Other targets are always of all objects.
+        input_mask: mask of all objects as a fourth channel of the images: None, ``"amodal"``
             (``foreground_masks``), or ``"visible"`` (``visible_masks``, from a mesh in each scan's folder).
         min_views: fewest different frames of a scene.
         augmentation: random changes of each scene, for training; None for none.
@@ -125,12 +126,12 @@ class SceneDataset(Dataset[SceneBatch]):
         if isinstance(annotations, str | Path):
             annotations = read_annotations(Path(annotations))
         self.scene_ids = choose_scenes(Path(scans_root), scene_ids, annotations)
-        self._scans = RecentScans(Path(scans_root), _MEMORY_OF_SCANS)
+        self._scans = RecentScans(Path(scans_root), _MAX_SCAN_BYTES)
         self._objects_of = ObjectTable([_objects_in(annotations, scene_id) for scene_id in self.scene_ids])
         self._shapenet_root = None if shapenet_root is None else Path(shapenet_root)
         self._cache = MaskCache(folder=Path(cache_dir))
         self._image_size = (int(image_size[0]), int(image_size[1]))
-        # The frames to be rendered are chosen, read and changed along with the others.
+        # The frames to be rendered are chosen, read and augmented along with the others.
         self._num_views, self._num_new_views = num_views + num_new_views, num_new_views
         self._min_views = min_views + num_new_views
         self._view_choice = view_choice
@@ -165,26 +166,27 @@ class SceneDataset(Dataset[SceneBatch]):
         )
         seen, rendered = self._hold_out(used, randomness)
         scene = self._scene(scan, views, used, seen, self._with_shapes(self._objects_of[index]))
-        shown = self._shown(scene, seen)
+        # Which objects the frames see is decided before augmentation: it depends on the cameras as on disk.
+        is_seen = self._seen_objects(scene, seen)
         if self._augmentation is not None:
             scene = self._augmentation(scene, randomness.generator(_AUGMENTATION))
         if rendered:
-            scene = _divided(scene, seen, rendered)
-        objects = () if scene.objects is None else scene.objects
-        wanted = self._targets & {"objects", "shapes"}
+            scene = _hold_out_views(scene, seen, rendered)
+        (objects,) = scene.objects or (ObjectSet.empty(),)
+        targets = None
+        if self._targets & {"objects", "shapes"}:
+            targets = (self._target_objects(objects, is_seen, scene.grid_center),)
         return replace(
             scene,
-            objects=tuple(self._wanted(part, shown, scene.grid_center) for part in objects)
-            if wanted
-            else None,
-            occupancy=self._occupancy(objects[0], scene.grid_center[0]) if objects else None,
+            objects=targets,
+            occupancy=self._occupancy(objects, scene.grid_center[0]),
             foreground=scene.foreground if "foreground" in self._targets else None,
         )
 
     def _scene(
         self, scan: Scan, views: Views, used: Sequence[int], seen: Sequence[int], objects: ObjectSet
     ) -> SceneBatch:
-        """Return a scene as it is on disk, with masks if they are wanted."""
+        """Return all N + V frames of a scene before augmentation, with all objects and the masks."""
         cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], self._image_size)
         foreground = self._foreground(objects, cameras)
         mask = self._visible(objects, cameras, scan) if self._input_mask == "visible" else foreground
@@ -210,7 +212,7 @@ class SceneDataset(Dataset[SceneBatch]):
         return self._augmentation.drop_frames(chosen, self._min_views, randomness.generator(_DROPOUT))
 
     def _hold_out(self, used: Sequence[int], randomness: _Randomness) -> tuple[list[int], list[int]]:
-        """Return the places of the frames to see and to render."""
+        """Return the positions in ``used`` of the frames to see and of those to render."""
         if not self._num_new_views:
             return list(range(len(used))), []
         generator = None if self._view_choice == "even" else randomness.generator(_HELD_OUT)
@@ -222,21 +224,21 @@ class SceneDataset(Dataset[SceneBatch]):
         shapes = shape_grids(objects.model_id, shapenet_root=self._shapenet_root, cache=self._cache)
         return replace(objects, shape=shapes)
 
-    def _wanted(self, objects: ObjectSet, shown: Tensor | None, grid_center: Tensor) -> ObjectSet:
-        """Return the objects that are targets, with shapes if these are."""
+    def _target_objects(self, objects: ObjectSet, is_seen: Tensor | None, grid_center: Tensor) -> ObjectSet:
+        """Return the objects that are targets by ``object_choice``, with shapes if these are targets."""
         if "shapes" not in self._targets:
             objects = replace(objects, shape=None)
         if self._object_choice == "in_volume":
             half = torch.tensor(self._grid_extent, dtype=torch.float64) / 2
-            shown = ((objects.center - grid_center).double().abs() <= half).all(dim=1)
-        return objects if shown is None else objects.select(shown)
+            return objects.select(((objects.center - grid_center).double().abs() <= half).all(dim=1))
+        return objects if is_seen is None else objects.select(is_seen)
 
-    def _shown(self, scene: SceneBatch, seen: Sequence[int]) -> Tensor | None:
+    def _seen_objects(self, scene: SceneBatch, seen: Sequence[int]) -> Tensor | None:
         """Return which objects the frames at ``seen`` see, ``(M,)`` bool; None if that is not asked for."""
         wanted = self._object_choice == "seen" and self._targets & {"objects", "shapes"}
         if not wanted or self._shapenet_root is None or scene.objects is None:
             return None
-        views = _some(scene.views, seen)
+        views = _select_views(scene.views, seen)
         cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], self._image_size)
         (objects,), root = scene.objects, self._shapenet_root
         return seen_objects(objects, cameras, shapenet_root=root, cache=self._cache).any(dim=0)
@@ -270,9 +272,9 @@ def scan2cad_dataset(root: Path, split: str, *, cache_dir: Path, **options: Any)
     ``scan2cad/full_annotations.json``; without any split file, all that do and are in ``scannet/scans``.
 
     Args:
-        root: of the three folders.
+        root: folder of the three folders.
         split: ``"train"`` or ``"val"``.
-        cache_dir: where targets are kept.
+        cache_dir: where targets are cached.
         options: further arguments of ``SceneDataset``.
 
     Raises:
@@ -286,10 +288,10 @@ def scan2cad_dataset(root: Path, split: str, *, cache_dir: Path, **options: Any)
     listed = read_split(root / "scannet", split)
     path = annotation_path(root)
     annotations = read_annotations(path)
-    having = set(annotated(annotations))
-    if not having:
+    with_objects = set(annotated(annotations))
+    if not with_objects:
         raise DataError(f"there is no scene with objects in {path}: copy the whole file")
-    scene_ids = None if listed is None else [scene_id for scene_id in listed if scene_id in having]
+    scene_ids = None if listed is None else [scene_id for scene_id in listed if scene_id in with_objects]
     if scene_ids == []:
         raise DataError(
             f"no scene with objects in {path} is in the {split} split: "
@@ -303,6 +305,44 @@ def scan2cad_dataset(root: Path, split: str, *, cache_dir: Path, **options: Any)
         cache_dir=cache_dir,
         **options,
     )
+
+
+class FewScenes(Dataset[SceneBatch]):
+    """The first scenes of another data set, the same in every epoch: to overfit on.
+
+    Args:
+        dataset: the data set.
+        num_scenes: number of scenes, at most.
+    """
+
+    def __init__(self, dataset: Dataset[SceneBatch], num_scenes: int) -> None:
+        self._dataset = dataset
+        self._length = min(num_scenes, len(dataset))  # type: ignore[arg-type]
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __getitem__(self, item: int | tuple[int, int]) -> SceneBatch:
+        """Return scene ``item``, or of (epoch, index) the scene ``index``, with B = 1."""
+        index = item[1] if isinstance(item, tuple) else item
+        if not 0 <= index < self._length:
+            raise IndexError(f"scene {index} of {self._length}")
+        return self._dataset[index]
+
+
+def few_scenes(*, root: Path, num_scenes: int, **options: Any) -> FewScenes:
+    """Return a few training scenes, always with the same evenly spread frames and without augmentation.
+
+    Training and validation get the same scenes, so that a network can learn them by heart.
+
+    Args:
+        root: see ``scan2cad_dataset``.
+        num_scenes: number of scenes.
+        options: further arguments of ``scan2cad_dataset``; its split, choice of frames and augmentation are
+            ignored.
+    """
+    fixed = options | {"split": "train", "view_choice": "even", "augmentation": None}
+    return FewScenes(scan2cad_dataset(root=root, **fixed), num_scenes)
 
 
 def _check(
@@ -330,19 +370,19 @@ def _check(
         )
 
 
-def _divided(scene: SceneBatch, seen: Sequence[int], rendered: Sequence[int]) -> SceneBatch:
-    """Return the scene with some of its views, by their places, as the new ones."""
+def _hold_out_views(scene: SceneBatch, seen: Sequence[int], rendered: Sequence[int]) -> SceneBatch:
+    """Return the scene with the views at positions ``seen``, and those at ``rendered`` as new views."""
     return replace(
         scene,
-        views=_some(scene.views, seen),
-        new_views=_some(scene.views, rendered),
-        frame_id=tuple(tuple(names[place] for place in seen) for names in scene.frame_id),
+        views=_select_views(scene.views, seen),
+        new_views=_select_views(scene.views, rendered),
+        frame_id=tuple(tuple(names[position] for position in seen) for names in scene.frame_id),
         foreground=None if scene.foreground is None else scene.foreground[:, list(seen)],
     )
 
 
-def _some(views: Views, places: Sequence[int]) -> Views:
-    chosen = list(places)
+def _select_views(views: Views, positions: Sequence[int]) -> Views:
+    chosen = list(positions)
     return Views(views.images[:, chosen], views.intrinsics[:, chosen], views.world_from_camera[:, chosen])
 
 

@@ -1,21 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One scan, its cameras read and its images at hand, whether it lies in a folder or a recording."""
+"""A posed scan of any source, open for reading: its cameras, and its images one at a time."""
 
 from __future__ import annotations
 
+import logging
+import re
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from raytran.data.images import decode_image
-from raytran.data.scannet.sens import SensFile
-from raytran.errors import DataError
+from raytran.data.images import MIN_VIEWS, read_frames
+from raytran.data.views import choose_even
+from raytran.geometry.camera import Cameras
+from raytran.structs import Views
+
+_log = logging.getLogger(__name__)
+
+LOST = "pose is not finite or no rigid motion"
+NO_IMAGE = "no image"
+NO_POSE = "no pose"
+"""Reasons for which a frame is dropped."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,68 +91,69 @@ class OpenScan(ABC):
         """Close the file, if one is open."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Scan(OpenScan):
-    """The usable frames of a folder.
+def even_views(
+    scan: OpenScan, *, image_size: tuple[int, int], num_views: int
+) -> tuple[Views, tuple[str, ...]]:
+    """Read evenly spread frames of an open scan; how many have no image or pose is logged.
 
-    Attributes:
-        folder: where it lies.
-        image_path: file of each usable frame.
+    Args:
+        scan: of any source.
+        image_size: ``(H, W)`` to which the images are resized; the intrinsics follow.
+        num_views: N.
+
+    Returns:
+        the views with B = 1 and the name of each frame.
+
+    Raises:
+        DataError: fewer than two images can be read.
     """
-
-    folder: Path
-    image_path: tuple[Path, ...]
-
-    @property
-    def path(self) -> Path:
-        """The scan's folder."""
-        return self.folder
-
-    def color_bytes(self, index: int) -> bytes:
-        """See ``OpenScan``."""
-        path = self.image_path[index]
-        try:
-            return path.read_bytes()
-        except OSError as error:
-            raise DataError(
-                f"cannot read the image {path} ({error.strerror}): copy or export it again"
-            ) from error
-
-    def read_color(self, index: int, image_size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-        """See ``OpenScan``."""
-        path = self.image_path[index]
-        image = decode_image(path, name=str(path), image_size=image_size, stored=self.image_size)
-        return image.permute(1, 2, 0).numpy()
-
-    def close(self) -> None:
-        """Do nothing: no file is open."""
+    report_dropped(scan)
+    views, used = scan_views(scan, choose_even(len(scan), num_views).tolist(), image_size=image_size)
+    return views, tuple(scan.frame_id[i] for i in used)
 
 
-@dataclass(frozen=True, kw_only=True)
-class SensScan(OpenScan):
-    """The usable frames of a ``.sens`` recording.
+def report_dropped(scan: OpenScan) -> None:
+    """Log how many frames of a scan have no image or pose."""
+    if scan.dropped:
+        total = len(scan) + len(scan.dropped)
+        reasons = ", ".join(sorted(set(scan.dropped.values())))
+        _log.info("%s: dropped %d of %d frames (%s)", scan.scene_id, len(scan.dropped), total, reasons)
 
-    Attributes:
-        file: the open recording.
-        file_index: number of each usable frame in it.
+
+def scan_views(
+    scan: OpenScan, chosen: Sequence[int], *, image_size: tuple[int, int], min_views: int = MIN_VIEWS
+) -> tuple[Views, list[int]]:
+    """Read the chosen frames of a scan; an unreadable one is replaced by its nearest readable neighbour.
+
+    Args:
+        scan: what ``open_scan`` or ``read_scan`` returned.
+        chosen: positions of N frames in it.
+        image_size: ``(H, W)`` to which the images are resized; the intrinsics follow.
+        min_views: fewest different frames.
+
+    Returns:
+        the views with B = 1 and the positions of the frames that were read.
+
+    Raises:
+        DataError: fewer than ``min_views`` different frames can be read.
     """
+    images, used = read_frames(
+        lambda index: _as_tensor(scan.read_color(index, image_size)),
+        len(scan),
+        chosen,
+        where=scan.path,
+        min_views=min_views,
+    )
+    pose = scan.world_from_camera[used]
+    cameras = Cameras(scan.intrinsics.expand(len(used), 3, 3), pose, scan.image_size).scaled_to(image_size)
+    return Views(images[None], cameras.intrinsics.float()[None], pose.float()[None]), used
 
-    file: SensFile
-    file_index: tuple[int, ...]
 
-    @property
-    def path(self) -> Path:
-        """The recording."""
-        return self.file.path
+def _as_tensor(image: NDArray[np.uint8]) -> Tensor:
+    return torch.from_numpy(image).permute(2, 0, 1)
 
-    def color_bytes(self, index: int) -> bytes | None:
-        """See ``OpenScan``."""
-        return self.file.color_bytes(self.file_index[index])
 
-    def read_color(self, index: int, image_size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-        """See ``OpenScan``."""
-        return self.file.read_color(self.file_index[index], image_size)
-
-    def close(self) -> None:
-        """Close the recording."""
-        self.file.close()
+def numbers_first(name: str) -> list[tuple[int, int, str]]:
+    """Key that sorts frame names by the numbers in them: 9 before 10, frame-9 before frame-10."""
+    parts = re.findall(r"\d+|\D+", name)
+    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]

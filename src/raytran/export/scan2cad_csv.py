@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import torch
 
-from raytran.data.atomic import write_text
+from raytran.data.files import write_text
 from raytran.errors import DataError
 from raytran.structs import CadAlignments
 

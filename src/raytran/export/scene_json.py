@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from raytran.data.atomic import write_text
+from raytran.data.files import write_text
 from raytran.errors import DataError
 from raytran.geometry.rotation import yaw_from_rotation
 from raytran.structs import CLASSES, ObjectSet, ScenePrediction

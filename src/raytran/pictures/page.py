@@ -10,7 +10,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from raytran.data.atomic import write_text
+from raytran.data.files import write_text
 
 
 def write_page(

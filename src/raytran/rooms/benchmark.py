@@ -13,7 +13,7 @@ from pathlib import Path
 from raytran.data.scene_list import read_split
 from raytran.errors import ConfigError
 from raytran.rooms.generate import RoomSplit, RoomsReport, make_splits
-from raytran.rooms.pool import MODELS_PER_CLASS
+from raytran.rooms.library import MODELS_PER_CLASS
 from raytran.rooms.scene import RoomSettings
 
 FORMAT = "raytran.rooms-v1/1"

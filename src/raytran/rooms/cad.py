@@ -12,22 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from raytran.errors import ConfigError
+from raytran.rooms.kinds import CATID_BY_CLASS
 from raytran.rooms.parametric import (
     bathtubs,
-    beds,
     bins,
     cabinets,
     chairs,
     displays,
-    lamps,
-    printers,
+    others,
     shelves,
     sofas,
-    stools,
-    swivels,
     tables,
 )
-from raytran.rooms.parametric.design import Design
+from raytran.rooms.parametric.parts import Design
 
 Recipe = Callable[[np.random.Generator], Design]
 
@@ -50,11 +47,11 @@ RECIPES: dict[str, tuple[tuple[float, Recipe], ...]] = {
     "chair": (
         (0.34, chairs.four_legged_chair),
         (0.10, chairs.cantilever_chair),
-        (0.28, swivels.office_chair),
+        (0.28, chairs.office_chair),
         (0.12, chairs.armchair),
-        (0.06, stools.pedestal_stool),
-        (0.06, stools.legged_stool),
-        (0.04, stools.pouffe),
+        (0.06, chairs.pedestal_stool),
+        (0.06, chairs.legged_stool),
+        (0.04, chairs.pouffe),
     ),
     "display": ((0.55, displays.monitor), (0.35, displays.television), (0.10, displays.tube_television)),
     "sofa": ((0.65, sofas.straight_sofa), (0.35, sofas.corner_sofa)),
@@ -74,29 +71,17 @@ RECIPES: dict[str, tuple[tuple[float, Recipe], ...]] = {
         (0.10, bins.wheeled_bin),
     ),
     "other": (
-        (0.30, beds.bed),
-        (0.15, beds.pillow),
-        (0.14, lamps.floor_lamp),
-        (0.06, lamps.arc_lamp),
-        (0.13, lamps.table_lamp),
-        (0.06, lamps.desk_lamp),
-        (0.11, printers.printer),
-        (0.05, printers.copier),
+        (0.30, others.bed),
+        (0.15, others.pillow),
+        (0.14, others.floor_lamp),
+        (0.06, others.arc_lamp),
+        (0.13, others.table_lamp),
+        (0.06, others.desk_lamp),
+        (0.11, others.printer),
+        (0.05, others.copier),
     ),
 }
 """Per class, what can be drawn and how often."""
-
-CATEGORY_IDS: dict[str, str] = {
-    "bathtub": "02808440",
-    "bookshelf": "02871439",
-    "cabinet": "02933112",
-    "chair": "03001627",
-    "display": "03211117",
-    "sofa": "04256520",
-    "table": "04379243",
-    "trashbin": "02747177",
-}
-"""ShapeNet's synset of every class but ``other``."""
 
 OTHER_IDS: dict[str, str] = {
     "bed": "02818832",
@@ -170,7 +155,7 @@ def finish_model(category: str, design: Design) -> CadModel:
         np.round(vertices, 6).tobytes() + faces.tobytes() + np.round(face_color, 4).tobytes()
     )
     return CadModel(
-        catid=OTHER_IDS[design.kind] if category == "other" else CATEGORY_IDS[category],
+        catid=OTHER_IDS[design.kind] if category == "other" else CATID_BY_CLASS[category],
         model_id=digest.hexdigest()[:32],
         category=category,
         kind=design.kind,

@@ -11,7 +11,7 @@ from scipy import ndimage
 from skimage.graph import MCP_Geometric
 
 from raytran.geometry.camera import pose_from_heading
-from raytran.rooms.collision import Boxes
+from raytran.rooms.objects import Boxes
 from raytran.rooms.render import Pinhole, Renderer
 from raytran.rooms.room import Room
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from raytran.rooms.cad import CadModel
 from raytran.rooms.layout import Layout
-from raytran.rooms.pool import ModelPool
+from raytran.rooms.library import ModelPool
 from raytran.structs import CLASSES
 
 ROOM_KINDS = {

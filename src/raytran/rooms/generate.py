@@ -15,11 +15,18 @@ from typing import Any
 
 import numpy as np
 
-from raytran.data.atomic import UNFINISHED, sweep, write_text
+from raytran.data.files import UNFINISHED, SettingsRecord, sweep, write_text
 from raytran.data.workers import work_on
 from raytran.errors import ConfigError, DataError
-from raytran.rooms.library import digest_of, list_models, read_library, survey, write_library
-from raytran.rooms.pool import MODELS_PER_CLASS, ModelPool
+from raytran.rooms.library import (
+    MODELS_PER_CLASS,
+    ModelPool,
+    digest_of,
+    list_models,
+    read_library,
+    survey,
+    write_library,
+)
 from raytran.rooms.scene import RoomSettings, make_scene
 from raytran.rooms.write import annotation_path, write_scene
 
@@ -237,21 +244,13 @@ def _check(settings: RoomSettings, num_train: int, num_val: int) -> None:
 
 def _claim(output: Path, asked: dict[str, Any]) -> None:
     """Write ``rooms.json``, or see that the one there asked for the same."""
-    path = output / "rooms.json"
-    asked = json.loads(json.dumps(asked))
-    if path.exists():
-        try:
-            found = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError:
-            found = {}
-        different = [key for key in {"cads": None} | asked if found.get(key) != asked.get(key)]
-        if different:
-            raise DataError(
-                f"{path} describes rooms made with other settings ({', '.join(different)}); "
-                "choose another output folder or remove this one"
-            )
-        return
-    write_text(path, json.dumps(asked, indent=2) + "\n")
+    record = SettingsRecord(output / "rooms.json")
+    different = record.begin(asked)
+    if different:
+        raise DataError(
+            f"{record.path} describes rooms made with other settings ({', '.join(different)}); "
+            "choose another output folder or remove this one"
+        )
 
 
 def _write_lists(output: Path, splits: Sequence[RoomSplit]) -> int:

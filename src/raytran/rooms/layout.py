@@ -11,8 +11,7 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from raytran.rooms.cad import CadModel
-from raytran.rooms.collision import Boxes, overlaps
-from raytran.rooms.placed import PlacedObject, cad_box, upright_rotation, yaw_facing
+from raytran.rooms.objects import Boxes, PlacedObject, cad_box, overlaps, upright_rotation, yaw_facing
 from raytran.rooms.room import Room
 
 MAX_TILT = np.deg2rad(4.0)

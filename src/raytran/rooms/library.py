@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CAD models of a folder in ShapeNet's layout, looked through once to furnish rooms with them."""
+"""The CAD models that rooms are furnished from: given ones in ShapeNet's layout, and generated ones."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 from collections import Counter
+from collections.abc import Collection
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -13,22 +14,27 @@ from typing import Any
 
 import numpy as np
 
-from raytran.data.atomic import write_json
-from raytran.data.shapenet.colors import read_face_colors
+from raytran.data.files import write_json
+from raytran.data.shapenet.meshes import read_face_colors
 from raytran.data.shapenet.models import mesh_path, model_names, read_mesh
 from raytran.data.workers import work_on
 from raytran.errors import DataError
-from raytran.rooms.cad import CadModel
-from raytran.rooms.kinds import KINDS
-from raytran.rooms.sizes import KNOWN_CATIDS, draw_size, guess_kind
+from raytran.rooms.cad import OTHER_IDS, CadModel, sample_model
+from raytran.rooms.kinds import KINDS, KNOWN_CATIDS, draw_size, guess_kind
 from raytran.rooms.symmetry import measure_symmetry
-from raytran.structs import CLASS_BY_CATID
+from raytran.structs import CLASS_BY_CATID, CLASSES
 
 MODELS_PER_CATEGORY = 150
 """Models of one synset that are looked at; of more, these are chosen by their names' hashes."""
 
 MOST_FACES = 100_000
 """Models with more triangles are left out: a few of them in a room slow every step down."""
+
+MODELS_PER_CLASS = 100
+"""Generated models of one class that the rooms of one split share, as scans share those of Scan2CAD."""
+
+FEW = 5
+"""Where a library has fewer models of what is wanted, generated ones make up this number."""
 
 SPLITS = ("train", "val")
 
@@ -248,3 +254,55 @@ def _load(root: Path, model: LibraryModel) -> CadModel:
         support=KINDS[model.kind].support,
         source=root,
     )
+
+
+@dataclass(frozen=True)
+class ModelPool:
+    """The CAD models that all rooms of one seed and split draw from.
+
+    Attributes:
+        seed: seed of the rooms.
+        library: CAD models given; None for generated ones alone.
+        split: whose models of the library are drawn, ``train`` or ``val``; None for all.
+        numbers: of the generated models of each class.
+    """
+
+    seed: int
+    library: CadLibrary | None = None
+    split: str | None = "train"
+    numbers: range = range(MODELS_PER_CLASS)
+
+    def draw(
+        self, category: str, rng: np.random.Generator, *, kinds: Collection[str] = ()
+    ) -> CadModel | None:
+        """Draw a model of a class, if ``kinds`` is not empty of one of these kinds; None if none is found."""
+        if self.library is not None:
+            given = [
+                model
+                for model in self.library.models
+                if self.split in (None, model.split)
+                and model.category == category
+                and (not kinds or model.kind in kinds)
+            ]
+            generated = category != "other" or not kinds or any(kind in OTHER_IDS for kind in kinds)
+            if not (given or generated):
+                return None
+            number = int(rng.integers(max(len(given), FEW if generated else 0)))
+            if number < len(given):
+                return self.library.load(given[number])
+        for number in rng.integers(self.numbers.start, self.numbers.stop, size=60):
+            model = _generated(self.seed, category, int(number))
+            if not kinds or model.kind in kinds:
+                return model
+        return None
+
+    def has(self, kind: str) -> bool:
+        """Say whether the library, in this split, has a model of a kind."""
+        models = () if self.library is None else self.library.models
+        return any(model.kind == kind and self.split in (None, model.split) for model in models)
+
+
+@lru_cache(maxsize=2048)
+def _generated(seed: int, category: str, number: int) -> CadModel:
+    # Scenes are seeded by two numbers, models by three: the streams never meet.
+    return sample_model(category, np.random.default_rng([seed, CLASSES.index(category), number]))

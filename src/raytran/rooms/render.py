@@ -15,9 +15,8 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from raytran.rooms.materials import TextureLibrary, texture_library
+from raytran.rooms.materials import Surfaces, TextureLibrary, texture_library
 from raytran.rooms.room import Light
-from raytran.rooms.surfaces import Surfaces
 
 Floats = NDArray[np.float32]
 

@@ -10,8 +10,8 @@ from typing import Any
 import trimesh
 from PIL import Image
 
-from raytran.data.atomic import UNFINISHED, write_json, write_text
-from raytran.data.prepare.report_text import class_table
+from raytran.data.files import whole_file, write_json, write_text
+from raytran.data.prepare.report import class_table
 from raytran.data.scan2cad import SceneAnnotation, read_annotations, scene_objects
 from raytran.data.scannet.scan import read_scan
 from raytran.data.targets import object_meshes
@@ -69,9 +69,9 @@ def draw_rooms(path: Path, root: Path) -> Path:
         for row in zip(*pairs, strict=True):
             blank = Image.new("RGB", row[0].size, "white")
             tiles += [*row, *([blank] * (_ROOMS_SHOWN - len(row)))]
-    temporary = path.with_name(f"{UNFINISHED}{path.name}")
-    contact_sheet(temporary, tiles, _ROOMS_SHOWN, width=_SHEET_WIDTH)
-    return temporary.replace(path)
+    with whole_file(path) as temporary:
+        contact_sheet(temporary, tiles, _ROOMS_SHOWN, width=_SHEET_WIDTH)
+    return path
 
 
 def _pictures(root: Path, annotation: SceneAnnotation) -> tuple[Image.Image, Image.Image]:

@@ -11,8 +11,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from raytran.rooms.materials import floor_paint, texture_index, tinted, wall_paint
-from raytran.rooms.surfaces import Paint, Surfaces, box_triangles, quad_triangles
+from raytran.rooms.materials import (
+    Paint,
+    Surfaces,
+    box_triangles,
+    floor_paint,
+    quad_triangles,
+    texture_index,
+    tinted,
+    wall_paint,
+)
 
 _WHITE = Paint(dark=(0.86, 0.86, 0.85), light=(0.93, 0.93, 0.92))
 

@@ -12,15 +12,13 @@ from numpy.typing import NDArray
 
 from raytran.errors import ConfigError
 from raytran.rooms.cameras import make_intrinsics, plan_path
-from raytran.rooms.collision import Boxes
 from raytran.rooms.furnish import ROOM_KINDS, Furnisher
 from raytran.rooms.layout import Layout
-from raytran.rooms.materials import texture_index, texture_library
-from raytran.rooms.placed import FLOOR, PlacedObject
-from raytran.rooms.pool import ModelPool
+from raytran.rooms.library import ModelPool
+from raytran.rooms.materials import Paint, Surfaces, texture_index, texture_library
+from raytran.rooms.objects import FLOOR, Boxes, PlacedObject
 from raytran.rooms.render import Pinhole, Renderer
 from raytran.rooms.room import Room, make_room
-from raytran.rooms.surfaces import Paint, Surfaces
 
 _ATTEMPTS = 40
 

@@ -4,13 +4,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from raytran.data.atomic import finished_folder
-from raytran.data.shapenet.binvox import write_binvox
+from raytran.data.files import finished_folder
+from raytran.data.shapenet.meshes import write_binvox
 from raytran.data.shapenet.models import STEM
 from raytran.data.shapenet.voxelize import scan_convert
 
@@ -21,11 +22,16 @@ BINVOX_SIZE = 128
 """Cells along each side of ShapeNet's voxel files."""
 
 
-def write_model(model: CadModel, root: Path) -> Path:
+def write_model(model: CadModel, root: Path, *, extra: Mapping[str, object] | None = None) -> Path:
     """Write a generated model as ``root/<catid>/<id>/models/model_normalized.*`` and return that folder.
 
     A folder that is already there is left alone: its name is drawn from the model's content. Several
     processes may write the same model at once.
+
+    Args:
+        model: the model.
+        root: folder in ShapeNet's layout.
+        extra: further entries of the model's ``.json``.
     """
     folder = root / model.catid / model.model_id / "models"
     if folder.is_dir():
@@ -33,7 +39,7 @@ def write_model(model: CadModel, root: Path) -> Path:
     with finished_folder(folder) as files:
         (files / f"{STEM}.obj").write_text(_obj_text(model), encoding="ascii")
         (files / f"{STEM}.mtl").write_text(_mtl_text(model), encoding="ascii")
-        (files / f"{STEM}.json").write_text(json.dumps(_facts(model)), encoding="ascii")
+        (files / f"{STEM}.json").write_text(json.dumps(_facts(model) | dict(extra or {})), encoding="ascii")
         _write_voxels(model, files)
     return folder
 

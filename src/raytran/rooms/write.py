@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from PIL import Image, ImageFilter
 from scipy.spatial.transform import Rotation
 
-from raytran.data.atomic import finished_folder, write_text
+from raytran.data.files import finished_folder, write_text
 from raytran.data.shapenet.models import copy_model
-from raytran.rooms.placed import PlacedObject
+from raytran.rooms.objects import PlacedObject
 from raytran.rooms.scene import Scene
 from raytran.rooms.shapenet_files import write_model
 

@@ -3,13 +3,11 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from raytran.data.files import finished_folder
 from raytran.errors import ConfigError
 
 
@@ -43,15 +41,5 @@ def replaced_folder(folder: Path, *, marker: str) -> Iterator[Path]:
     """
     folder = folder.resolve()
     check_replaceable(folder, marker=marker)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    sibling = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", suffix=".part", dir=folder.parent))
-    try:
-        # The permissions of an ordinary new folder; mkdtemp's are for the owner alone.
-        fresh = sibling / folder.name
-        fresh.mkdir()
+    with finished_folder(folder, replace=True) as fresh:
         yield fresh
-        if folder.exists():
-            os.replace(folder, sibling / "earlier")
-        os.replace(fresh, folder)
-    finally:
-        shutil.rmtree(sibling, ignore_errors=True)

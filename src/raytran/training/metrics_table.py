@@ -12,7 +12,7 @@ from typing import Any
 from lightning.pytorch.loggers import Logger
 from lightning.pytorch.utilities import rank_zero_only
 
-from raytran.data.atomic import write_text
+from raytran.data.files import write_text
 
 _log = logging.getLogger(__name__)
 

@@ -18,7 +18,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from raytran.data.atomic import write_json
+from raytran.data.files import write_json
 from raytran.geometry.grid import VoxelGrid
 from raytran.structs import CLASSES, ObjectSet, ScenePrediction, Views
 from raytran.viewer.view_errors import object_errors

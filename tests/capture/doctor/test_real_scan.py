@@ -12,7 +12,7 @@ import pytest
 
 from raytran.capture.doctor.examine import examine
 from raytran.data.scan2cad import read_annotations
-from raytran.data.scannet.sources import find_scans
+from raytran.data.scannet.find import find_scans
 
 from .conftest import OPENGL
 

@@ -3,9 +3,9 @@ from __future__ import annotations
 
 import pytest
 
-from raytran.data.atomic import bytes_below
+from raytran.data.files import bytes_below
 from raytran.data.prepare.estimate import Estimate, estimate
-from raytran.data.prepare.settings import PrepareSettings
+from raytran.data.prepare.scan import PrepareSettings
 from raytran.data.prepare.sources import Released, read_sources
 
 SETTINGS = PrepareSettings((16, 24), max_frames=3)

@@ -17,6 +17,7 @@ from PIL import Image
 
 from raytran.data.dataset import scan2cad_dataset
 from raytran.data.prepare import PrepareSettings, Released, prepare_scan2cad
+from raytran.data.prepare.prepare import claimed
 from raytran.data.scan2cad import read_annotations
 from raytran.data.scannet.scan import read_scan, read_sens
 from raytran.errors import ConfigError, DataError
@@ -139,7 +140,7 @@ def test_a_broken_off_run_is_finished_and_nothing_done_twice(released, prepare, 
     shutil.rmtree(out / "scannet/scans/scene0001_00")
     for name in ("scannet/scans/.unfinished-x.1/x/color", "shapenet/03001627/.unfinished-abc/models"):
         (out / name).mkdir(parents=True)
-    for name in (".unfinished-report.json.1", "cache/shape/aa/key-1.tmp"):
+    for name in (".unfinished-report.json.1", "cache/shape/aa/.unfinished-1-key"):
         (out / name).parent.mkdir(parents=True, exist_ok=True)
         (out / name).write_text("half")
     (out / "report.json").unlink()
@@ -386,3 +387,46 @@ def test_a_folder_without_cad_models_is_refused_before_anything_is_written(relea
     with pytest.raises(DataError, match=r"no CAD model .*scannet; give the folder that holds ShapeNetCore"):
         prepare(released, tmp_path / "out", shapenet=released / "scannet")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_new_folder_is_claimed_and_may_be_claimed_again(tmp_path):
+    for _ in range(2):
+        with claimed(tmp_path / "out", PrepareSettings(), {"annotations": "abc"}):
+            found = json.loads((tmp_path / "out" / "prepare.json").read_text())
+        assert found["image_size"] == [480, 640]
+        assert found["annotations"] == "abc"
+
+
+@pytest.mark.parametrize(
+    ("settings", "sources", "named"),
+    [
+        (PrepareSettings(masks=False), {"annotations": "abc"}, "another masks;"),
+        (PrepareSettings((96, 128), 5), {"annotations": "x"}, "another image_size, max_frames, annotations;"),
+    ],
+)
+def test_a_folder_claimed_with_other_settings_is_refused(tmp_path, settings, sources, named):
+    with claimed(tmp_path, PrepareSettings(), {"annotations": "abc"}):
+        pass
+    with pytest.raises(DataError, match=named), claimed(tmp_path, settings, sources):
+        pass
+
+
+def test_a_damaged_marker_is_refused(tmp_path):
+    (tmp_path / "prepare.json").write_text("{")
+    with pytest.raises(DataError, match=r"prepare\.json"), claimed(tmp_path, PrepareSettings(), {}):
+        pass
+
+
+def test_only_one_at_a_time(tmp_path):
+    with claimed(tmp_path, PrepareSettings(), {}):
+        again = claimed(tmp_path, PrepareSettings(), {})
+        with pytest.raises(DataError, match="another process prepares"), again:
+            pass
+    with claimed(tmp_path, PrepareSettings(), {}):
+        pass
+
+
+@pytest.mark.parametrize("wrong", [{"image_size": (8, 640)}, {"max_frames": 1}])
+def test_contradictions_are_refused(wrong):
+    with pytest.raises(ConfigError, match="max_frames"):
+        PrepareSettings(**wrong)

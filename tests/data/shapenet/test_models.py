@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from raytran.data.shapenet.binvox import read_binvox, write_binvox
+from raytran.data.shapenet.meshes import read_binvox, write_binvox
 from raytran.data.shapenet.models import (
     copy_model,
     has_model,

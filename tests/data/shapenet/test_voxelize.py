@@ -13,7 +13,7 @@ import trimesh
 from scipy.ndimage import binary_dilation
 
 from raytran.data.shapenet import voxelize
-from raytran.data.shapenet.binvox import read_binvox
+from raytran.data.shapenet.meshes import read_binvox
 from raytran.data.shapenet.models import read_mesh
 from raytran.data.shapenet.voxelize import scan_convert, voxelize_solid
 

@@ -12,7 +12,8 @@ import torch
 from PIL import Image
 from torch import nn
 
-from raytran.data.scannet.scan import even_views, read_scan
+from raytran.data.scan import even_views
+from raytran.data.scannet.scan import read_scan
 from raytran.errors import DataError
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.rotation import rotation_from_yaw

@@ -22,8 +22,8 @@ from raytran.capture.doctor.sightings import Sightings, depth_at, sightings_from
 from raytran.capture.doctor.world import check_unit, check_up, check_volume
 from raytran.data.scan import OpenScan
 from raytran.data.scan2cad import SceneAnnotation, scene_objects
+from raytran.data.scannet.find import ScanSource
 from raytran.data.scannet.layout import find_layout
-from raytran.data.scannet.sources import ScanSource
 from raytran.data.scannet.text import are_rigid, read_matrix
 from raytran.errors import DataError
 from raytran.structs import ObjectSet

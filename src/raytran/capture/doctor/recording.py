@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from raytran.data.images import MAX_SIDE
-from raytran.data.scan import OpenScan, Scan, SensScan
+from raytran.data.scan import OpenScan
+from raytran.data.scannet.scan import Scan, SensScan
 from raytran.errors import DataError
 
 _MILLIMETRES = 1000.0

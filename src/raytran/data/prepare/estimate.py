@@ -14,13 +14,11 @@ from functools import partial
 from pathlib import Path
 from statistics import fmean, median
 
-from raytran.data.atomic import UNFINISHED, bytes_below
+from raytran.data.files import UNFINISHED, bytes_below
 from raytran.data.prepare.annotation import used_models, without_models
-from raytran.data.prepare.frames import choose_frames, encoded_frame
-from raytran.data.prepare.models import prepare_model
-from raytran.data.prepare.report_text import gigabytes
-from raytran.data.prepare.scan import ScanJob, write_masks
-from raytran.data.prepare.settings import PrepareSettings
+from raytran.data.prepare.report import gigabytes
+from raytran.data.prepare.scan import PrepareSettings, ScanJob, choose_frames, encoded_frame
+from raytran.data.prepare.targets import prepare_model, write_masks
 from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
 

@@ -1,32 +1,60 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One scan, from any released form to the prepared folder and the masks of its frames."""
+"""One scan, from any released form to the prepared folder: few small frames, their cameras and masks."""
 
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import torch
+from PIL import Image
+from torch import Tensor
 
-from raytran.data.atomic import finished_folder, no_room, write_json
-from raytran.data.cache import MaskCache
+from raytran.data.files import finished_folder, write_json
 from raytran.data.images import MIN_VIEWS
 from raytran.data.prepare.annotation import Entry
-from raytran.data.prepare.frames import homogeneous, matrix_text, write_frames
-from raytran.data.prepare.settings import PrepareSettings
-from raytran.data.scan2cad import parse_entry, scene_objects
+from raytran.data.prepare.targets import check_disk, write_masks
+from raytran.data.scan import OpenScan
+from raytran.data.scannet.find import ScanSource
 from raytran.data.scannet.scan import read_scan
-from raytran.data.scannet.sources import ScanSource
-from raytran.data.targets import foreground_masks
-from raytran.errors import DataError
+from raytran.data.views import choose_even
+from raytran.errors import ConfigError, DataError
 from raytran.geometry.camera import Cameras
 
 FACTS = "prepared.json"
 """What became of a scan's frames; part of its prepared folder."""
 
-_MASKS_AT_ONCE = 20
+JPEG_QUALITY = 90
+"""Of frames that were resized; ones that have the right size already keep their bytes."""
+
+_PNG = b"\x89PNG"
+
+
+@dataclass(frozen=True)
+class PrepareSettings:
+    """What decides the bytes of a prepared scan.
+
+    Attributes:
+        image_size: ``(H, W)`` of the frames.
+        max_frames: at most so many frames a scan, evenly spread; None for all.
+        masks: whether the amodal masks of all frames are made ahead of training.
+    """
+
+    image_size: tuple[int, int] = (480, 640)
+    max_frames: int | None = 200
+    masks: bool = True
+
+    def __post_init__(self) -> None:
+        if min(self.image_size) < 16 or (self.max_frames is not None and self.max_frames < 2):
+            raise ConfigError(
+                "expected images of at least 16 × 16 pixels and max_frames ≥ 2, got "
+                f"image_size={list(self.image_size)} and max_frames={self.max_frames}"
+            )
 
 
 @dataclass(frozen=True)
@@ -68,47 +96,9 @@ def prepare_scan(job: ScanJob, output: Path, settings: PrepareSettings) -> tuple
                     write_masks(job.entry, cameras, output)
             return job.scene_id, None
         except (DataError, OSError) as error:
-            check_room(error, output)
+            check_disk(error, output)
             reasons.append(str(error))
     return job.scene_id, "; ".join(reasons)
-
-
-def write_masks(entry: Entry, cameras: Cameras, output: Path) -> None:
-    """Make the amodal masks that a data set will ask for.
-
-    Args:
-        entry: annotation of the scan.
-        cameras: of N frames.
-        output: folder with ``shapenet/``; gets ``cache/``.
-
-    Raises:
-        DataError: a CAD model cannot be used, or the disk is full.
-    """
-    objects = scene_objects(parse_entry(entry))
-    cache = MaskCache(folder=output / "cache")
-    parts = zip(
-        cameras.intrinsics.float().split(_MASKS_AT_ONCE),
-        cameras.world_from_camera.float().split(_MASKS_AT_ONCE),
-        strict=True,
-    )
-    for part in parts:
-        foreground_masks(
-            objects, Cameras(*part, cameras.image_size), shapenet_root=output / "shapenet", cache=cache
-        )
-
-
-def check_room(error: BaseException, output: Path) -> None:
-    """Raise one sentence if ``error`` comes from a full or read-only disk.
-
-    Raises:
-        DataError: it does.
-    """
-    cause = no_room(error)
-    if cause is not None:
-        raise DataError(
-            f"cannot go on writing to {output} ({cause.strerror}): make room there and give the same command "
-            "again, finished scans are kept"
-        ) from error
 
 
 def read_facts(output: Path, scene_id: str) -> dict[str, Any]:
@@ -176,3 +166,97 @@ def _write_camera_facts(folder: Path, cameras: Cameras, axis_alignment: torch.Te
     }
     lines = "".join(f"{key} = {value}\n" for key, value in facts.items())
     (folder / f"{folder.name}.txt").write_text(lines, encoding="ascii")
+
+
+def write_frames(
+    scan: OpenScan, folder: Path, *, image_size: tuple[int, int], max_frames: int | None
+) -> tuple[list[int], dict[str, str]]:
+    """Write the chosen frames and their poses; a damaged frame is replaced by the nearest one left.
+
+    Args:
+        scan: an open scan.
+        folder: of the prepared scan; gets ``color/`` and ``pose/``.
+        image_size: ``(H, W)``.
+        max_frames: at most so many, evenly spread; None for all.
+
+    Returns:
+        the positions that were written, ascending, and what is wrong with each damaged one, by its name.
+    """
+    (folder / "color").mkdir()
+    (folder / "pose").mkdir()
+    names = frame_names(scan.frame_id)
+    damaged: dict[int, str] = {}
+    taken: set[int] = set()
+    chosen = choose_frames(len(names), max_frames)
+    reserved = set(chosen)
+
+    def write(position: int) -> bool:
+        try:
+            content, ending = encoded_frame(scan, position, image_size)
+        except DataError as error:
+            damaged[position] = str(error)
+            return False
+        (folder / "color" / f"{names[position]}{ending}").write_bytes(content)
+        pose = matrix_text(scan.world_from_camera[position])
+        (folder / "pose" / f"{names[position]}.txt").write_text(pose, encoding="ascii")
+        taken.add(position)
+        return True
+
+    for position in chosen:
+        if not write(position):
+            spare = (p for p in nearest_first(position, len(names)) if p not in reserved and p not in damaged)
+            next((p for p in spare if p not in taken and write(p)), None)
+    return sorted(taken), {scan.frame_id[p]: damaged[p] for p in sorted(damaged)}
+
+
+def choose_frames(count: int, max_frames: int | None) -> list[int]:
+    """Return the positions of at most ``max_frames`` evenly spread ones of ``count`` frames."""
+    if max_frames is None or count <= max_frames:
+        return list(range(count))
+    return choose_even(count, max_frames).tolist()
+
+
+def frame_names(frame_ids: Sequence[str]) -> list[str]:
+    """Return the number in each frame's name, ``000010`` becomes ``10``; the names if two have the same."""
+    numbers = [re.findall(r"\d+", name) for name in frame_ids]
+    plain = [str(int(found[-1])) if found else name for found, name in zip(numbers, frame_ids, strict=True)]
+    return plain if len(set(plain)) == len(plain) else list(frame_ids)
+
+
+def encoded_frame(scan: OpenScan, position: int, image_size: tuple[int, int]) -> tuple[bytes, str]:
+    """Return a frame of the prepared size and its ending, ``.jpg`` or ``.png``.
+
+    A stored frame that has the size already comes as it is, after it was decoded to see that it is whole.
+
+    Args:
+        scan: an open scan.
+        position: of the frame in it.
+        image_size: ``(H, W)``.
+
+    Raises:
+        DataError: the frame is truncated, damaged, or of another size than the others.
+    """
+    stored = scan.color_bytes(position) if scan.image_size == image_size else None
+    if stored is not None:
+        scan.read_color(position)
+        return stored, ".png" if stored.startswith(_PNG) else ".jpg"
+    file = BytesIO()
+    Image.fromarray(scan.read_color(position, image_size)).save(file, "JPEG", quality=JPEG_QUALITY)
+    return file.getvalue(), ".jpg"
+
+
+def nearest_first(position: int, count: int) -> Iterator[int]:
+    """Yield the positions from 0 to ``count`` - 1, those near ``position`` first."""
+    yield from sorted(range(count), key=lambda other: (abs(other - position), other))
+
+
+def matrix_text(matrix: Tensor) -> str:
+    """Return a matrix as lines of numbers that read back as the same float64."""
+    return "".join(" ".join(repr(value) for value in row) + "\n" for row in matrix.double().tolist())
+
+
+def homogeneous(intrinsics: Tensor) -> Tensor:
+    """Return ``(3, 3)`` intrinsics as the 4×4 of ScanNet's files."""
+    matrix = torch.eye(4, dtype=torch.float64)
+    matrix[:3, :3] = intrinsics
+    return matrix

@@ -1,18 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The released files that a preparation is given, recognised and read as far as they are lists."""
+"""The released files that a preparation is given, and which of the scans among them it prepares."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 
-from raytran.data.prepare.annotation import Annotations, find_annotations, read_usable
-from raytran.data.prepare.selection import Selection, select_scans
-from raytran.data.scannet.sources import ScanSource, find_scans, read_splits
+from raytran.data.prepare.annotation import Annotations, Entry, find_annotations, read_usable
+from raytran.data.prepare.scan import ScanJob
+from raytran.data.scannet.find import SPLITS, ScanSource, find_scans, read_splits
 from raytran.data.shapenet.models import Version, shapenet_version
-from raytran.errors import ConfigError
+from raytran.errors import ConfigError, DataError
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,27 @@ class Released:
     scan2cad: Path | None = None
     scenes: Sequence[str] | None = None
     splits: Sequence[str] = ("train", "val")
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The scans to prepare, and what was noticed on the way.
+
+    Attributes:
+        jobs: by name.
+        splits: scans of each split that was asked for, in the order of its file; empty without split files.
+        without_annotation: scans that are there but have no annotation, so they are not prepared.
+        without_scan: annotated scans of these splits that are not there.
+        duplicates: places of each scan that is there several times, the one that is taken first.
+        in_no_split: scans that are there but in no split file.
+    """
+
+    jobs: tuple[ScanJob, ...]
+    splits: dict[str, list[str]]
+    without_annotation: list[str]
+    without_scan: list[str]
+    duplicates: dict[str, list[str]]
+    in_no_split: list[str]
 
 
 @dataclass(frozen=True)
@@ -97,3 +119,86 @@ def _outside(output: Path, found: Mapping[str, Sequence[ScanSource]]) -> dict[st
         for scan, sources in found.items()
     }
     return {scan: sources for scan, sources in others.items() if sources}
+
+
+def select_scans(
+    found: Mapping[str, Sequence[ScanSource]],
+    listed: Mapping[str, Sequence[str]],
+    annotations: Annotations | None,
+    *,
+    root: Path,
+    scenes: Sequence[str] | None,
+    splits: Sequence[str],
+) -> Selection:
+    """Choose the scans to prepare.
+
+    Scans named by ``scenes`` are prepared with or without annotation; all others only with one, unless there
+    are no annotations at all.
+
+    Args:
+        found: sources of each scan, best first.
+        listed: scans of each split file; empty if there are none, and then every scan counts.
+        annotations: None if none are given.
+        root: where scans were looked for.
+        scenes: names or patterns such as ``scene01*``; None for all.
+        splits: some of ``SPLITS``.
+
+    Raises:
+        ConfigError: an unknown split.
+        DataError: a name in ``scenes`` matches nothing, or no scan is left.
+    """
+    if unknown := set(splits) - set(SPLITS):
+        raise ConfigError(f"unknown splits {sorted(unknown)}: choose from {', '.join(SPLITS)}")
+    lists = {split: list(listed.get(split, ())) for split in SPLITS if split in splits}
+    in_scope = {scan for scans in lists.values() for scan in scans} if listed else set(found)
+    entries: Mapping[str, Entry] = {} if annotations is None else annotations.entries
+    if scenes is not None:
+        in_scope &= set(_named(scenes, [*found, *entries], in_scope, root, splits))
+    chosen = sorted(in_scope & set(found))
+    bare = [scan for scan in chosen if annotations is not None and scan not in entries]
+    skipped = bare if scenes is None else []
+    jobs = tuple(
+        ScanJob(scan, tuple(found[scan]), entries.get(scan)) for scan in chosen if scan not in skipped
+    )
+    if not jobs:
+        raise _nothing_left(set(chosen), root)
+    in_lists = {scan for scans in listed.values() for scan in scans}
+    return Selection(
+        jobs=jobs,
+        splits=lists if listed else {},
+        without_annotation=bare,
+        without_scan=sorted((in_scope if listed else set(entries)) & set(entries) - set(found)),
+        duplicates={scan: [_place(s, root) for s in found[scan]] for scan in chosen if len(found[scan]) > 1},
+        in_no_split=sorted(set(found) - in_lists) if listed else [],
+    )
+
+
+def _named(
+    patterns: Sequence[str], known: Sequence[str], in_scope: set[str], root: Path, splits: Sequence[str]
+) -> list[str]:
+    """Return the scans that match; every pattern must match one of the splits that were asked for."""
+    matches = {
+        pattern: [scan for scan in dict.fromkeys(known) if fnmatchcase(scan, pattern)] for pattern in patterns
+    }
+    for pattern, scans in matches.items():
+        if not scans:
+            raise DataError(f"no scan in {root} or the annotations is called {pattern}: check scenes=")
+        if not in_scope & set(scans):
+            raise DataError(f"{pattern} is in none of splits=[{', '.join(splits)}]: add its split to splits=")
+    return [scan for scans in matches.values() for scan in scans]
+
+
+def _nothing_left(there: set[str], root: Path) -> DataError:
+    if there:
+        return DataError(
+            f"none of the {len(there)} chosen scans in {root} has objects in the annotations: "
+            "check that the files belong together"
+        )
+    return DataError(
+        f"none of the scans that were asked for is in {root}: check scannet=, scenes= and splits="
+    )
+
+
+def _place(source: ScanSource, root: Path) -> str:
+    path = source.path
+    return f"{source.form}: {path.relative_to(root) if path.is_relative_to(root) else path}"

@@ -4,18 +4,16 @@
 from __future__ import annotations
 
 import logging
-import re
-from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from raytran.data.images import MIN_VIEWS, read_frames, stored_size
-from raytran.data.scan import OpenScan, Scan, SensScan
-from raytran.data.scannet.layout import Layout, Listing, find_layout, recognise
+from raytran.data.images import decode_image, stored_size
+from raytran.data.scan import LOST, NO_IMAGE, NO_POSE, OpenScan, even_views, numbers_first
+from raytran.data.scannet.layout import Listing, find_layout, recognise
 from raytran.data.scannet.sens import SensFile
 from raytran.data.scannet.text import (
     are_rigid,
@@ -25,38 +23,136 @@ from raytran.data.scannet.text import (
     read_intrinsics,
     read_matrix,
 )
-from raytran.data.views import choose_even
 from raytran.errors import DataError
-from raytran.geometry.camera import Cameras
 from raytran.structs import Views
 
 _log = logging.getLogger(__name__)
 
-LOST = "pose is not finite or no rigid motion"
-NO_IMAGE = "no image"
-NO_POSE = "no pose"
 CUT = "the file ends here"
-"""Reasons for which a frame is dropped."""
+"""Reason for which the frames after the end of a damaged recording are dropped."""
 
 _NO_MATRIX = np.full((4, 4), np.nan)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scan(OpenScan):
+    """The usable frames of a folder.
+
+    Attributes:
+        folder: where it lies.
+        image_path: file of each usable frame.
+    """
+
+    folder: Path
+    image_path: tuple[Path, ...]
+
+    @property
+    def path(self) -> Path:
+        """The scan's folder."""
+        return self.folder
+
+    def color_bytes(self, index: int) -> bytes:
+        """See ``OpenScan``."""
+        path = self.image_path[index]
+        try:
+            return path.read_bytes()
+        except OSError as error:
+            raise DataError(
+                f"cannot read the image {path} ({error.strerror}): copy or export it again"
+            ) from error
+
+    def read_color(self, index: int, image_size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+        """See ``OpenScan``."""
+        path = self.image_path[index]
+        image = decode_image(path, name=str(path), image_size=image_size, stored=self.image_size)
+        return image.permute(1, 2, 0).numpy()
+
+    def close(self) -> None:
+        """Do nothing: no file is open."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensScan(OpenScan):
+    """The usable frames of a ``.sens`` recording.
+
+    Attributes:
+        file: the open recording.
+        file_index: number of each usable frame in it.
+    """
+
+    file: SensFile
+    file_index: tuple[int, ...]
+
+    @property
+    def path(self) -> Path:
+        """The recording."""
+        return self.file.path
+
+    def color_bytes(self, index: int) -> bytes | None:
+        """See ``OpenScan``."""
+        return self.file.color_bytes(self.file_index[index])
+
+    def read_color(self, index: int, image_size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+        """See ``OpenScan``."""
+        return self.file.read_color(self.file_index[index], image_size)
+
+    def close(self) -> None:
+        """Close the recording."""
+        self.file.close()
 
 
 def read_scan(folder: Path, *, header: Path | None = None, any_size: bool = False) -> Scan:
     """Read a scan's cameras and the list of its frames; images are read later.
 
     A frame without an image or with a pose that is no rigid motion (ScanNet writes ``-inf`` where tracking
-    was lost) is dropped, and the reason kept.
+    was lost) is dropped, and the reason is recorded.
 
     Args:
-        folder: a scan in one of the exported forms of ``scan_layout.FORMS``.
+        folder: a scan in one of the exported forms of ``layout.FORMS``.
         header: its ``<scan>.txt``; if None the one in the folder, which may be missing.
-        any_size: whether intrinsics may be for another image size; the data doctor wants them as they are.
+        any_size: accept intrinsics for another image size, as the data doctor does to name the fault.
 
     Raises:
         DataError: the folder or a part of it is missing, no pose is valid, or the intrinsics are for another
             image size.
     """
-    return _read_layout(find_layout(Path(folder)), header, any_size)
+    layout = find_layout(Path(folder))
+    folder = layout.scan
+    images, pose_files = layout.images(), layout.poses()
+    complete = sorted(images.keys() & pose_files.keys(), key=numbers_first)
+    dropped = {name: NO_IMAGE for name in pose_files.keys() - images.keys()}
+    dropped |= {name: NO_POSE for name in images.keys() - pose_files.keys()}
+    matrices = [read_matrix(pose_files[name]) for name in complete]
+    poses = np.array([_NO_MATRIX if matrix is None else matrix for matrix in matrices]).reshape(-1, 4, 4)
+    rigid = are_rigid(poses)
+    dropped |= {name: LOST for name, is_rigid in zip(complete, rigid, strict=True) if not is_rigid}
+    names = [name for name, is_rigid in zip(complete, rigid, strict=True) if is_rigid]
+    if not names:
+        raise DataError(
+            f"none of the {len(dropped)} frames in {folder} has an image and a valid pose: check that each "
+            "image has a text file of its name with a finite 4x4 camera-to-world matrix"
+        )
+    header = header or folder / f"{folder.name}.txt"
+    facts = read_header(header)
+    image_size = stored_size([images[name] for name in names])
+    intrinsics_file = layout.intrinsics()
+    return Scan(
+        scene_id=folder.name,
+        folder=folder,
+        frame_id=tuple(names),
+        image_path=tuple(images[name] for name in names),
+        world_from_camera=torch.from_numpy(poses[rigid]),
+        intrinsics=check_intrinsics(
+            read_intrinsics(intrinsics_file),
+            intrinsics_file,
+            image_size=image_size,
+            header=facts,
+            any_size=any_size,
+        ),
+        image_size=image_size,
+        axis_alignment=axis_alignment(facts, header),
+        dropped={name: dropped[name] for name in sorted(dropped, key=numbers_first)},
+    )
 
 
 def read_sens(
@@ -147,106 +243,3 @@ def load_views(
     """
     with open_scan(Path(folder)) as scan:
         return even_views(scan, image_size=image_size, num_views=num_views)
-
-
-def even_views(
-    scan: OpenScan, *, image_size: tuple[int, int], num_views: int
-) -> tuple[Views, tuple[str, ...]]:
-    """Read evenly spread frames of an open scan; how many have no image or pose is logged.
-
-    Args:
-        scan: of any source.
-        image_size: ``(H, W)`` to which the images are resized; the intrinsics follow.
-        num_views: N.
-
-    Returns:
-        the views with B = 1 and the name of each frame.
-
-    Raises:
-        DataError: fewer than two images can be read.
-    """
-    report_dropped(scan)
-    views, used = scan_views(scan, choose_even(len(scan), num_views).tolist(), image_size=image_size)
-    return views, tuple(scan.frame_id[i] for i in used)
-
-
-def report_dropped(scan: OpenScan) -> None:
-    """Log how many frames of a scan have no image or pose."""
-    if scan.dropped:
-        total = len(scan) + len(scan.dropped)
-        reasons = ", ".join(sorted(set(scan.dropped.values())))
-        _log.info("%s: dropped %d of %d frames (%s)", scan.scene_id, len(scan.dropped), total, reasons)
-
-
-def scan_views(
-    scan: OpenScan, chosen: Sequence[int], *, image_size: tuple[int, int], min_views: int = MIN_VIEWS
-) -> tuple[Views, list[int]]:
-    """Read the chosen frames of a scan; an unreadable one is replaced by its nearest readable neighbour.
-
-    Args:
-        scan: what ``open_scan`` or ``read_scan`` returned.
-        chosen: positions of N frames in it.
-        image_size: ``(H, W)`` to which the images are resized; the intrinsics follow.
-        min_views: fewest different frames.
-
-    Returns:
-        the views with B = 1 and the positions of the frames that were read.
-
-    Raises:
-        DataError: fewer than ``min_views`` different frames can be read.
-    """
-    images, used = read_frames(
-        lambda index: _as_tensor(scan.read_color(index, image_size)),
-        len(scan),
-        chosen,
-        where=scan.path,
-        min_views=min_views,
-    )
-    pose = scan.world_from_camera[used]
-    cameras = Cameras(scan.intrinsics.expand(len(used), 3, 3), pose, scan.image_size).scaled_to(image_size)
-    return Views(images[None], cameras.intrinsics.float()[None], pose.float()[None]), used
-
-
-def _read_layout(layout: Layout, header: Path | None, any_size: bool) -> Scan:
-    folder = layout.scan
-    images, pose_files = layout.images(), layout.poses()
-    both = sorted(images.keys() & pose_files.keys(), key=numbers_first)
-    dropped = {name: NO_IMAGE for name in pose_files.keys() - images.keys()}
-    dropped |= {name: NO_POSE for name in images.keys() - pose_files.keys()}
-    matrices = [read_matrix(pose_files[name]) for name in both]
-    poses = np.array([_NO_MATRIX if matrix is None else matrix for matrix in matrices]).reshape(-1, 4, 4)
-    rigid = are_rigid(poses)
-    dropped |= {name: LOST for name, good in zip(both, rigid, strict=True) if not good}
-    names = [name for name, good in zip(both, rigid, strict=True) if good]
-    if not names:
-        raise DataError(
-            f"none of the {len(dropped)} frames in {folder} has an image and a valid pose: check that each "
-            "image has a text file of its name with a finite 4x4 camera-to-world matrix"
-        )
-    header = header or folder / f"{folder.name}.txt"
-    facts = read_header(header)
-    image_size = stored_size([images[name] for name in names])
-    intrinsics = layout.intrinsics()
-    return Scan(
-        scene_id=folder.name,
-        folder=folder,
-        frame_id=tuple(names),
-        image_path=tuple(images[name] for name in names),
-        world_from_camera=torch.from_numpy(poses[rigid]),
-        intrinsics=check_intrinsics(
-            read_intrinsics(intrinsics), intrinsics, image_size=image_size, header=facts, any_size=any_size
-        ),
-        image_size=image_size,
-        axis_alignment=axis_alignment(facts, header),
-        dropped={name: dropped[name] for name in sorted(dropped, key=numbers_first)},
-    )
-
-
-def _as_tensor(image: NDArray[np.uint8]) -> Tensor:
-    return torch.from_numpy(image).permute(2, 0, 1)
-
-
-def numbers_first(name: str) -> list[tuple[int, int, str]]:
-    """Key that sorts frame names by the numbers in them: 9 before 10, frame-9 before frame-10."""
-    parts = re.findall(r"\d+|\D+", name)
-    return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]

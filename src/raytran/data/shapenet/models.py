@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CAD models of ShapeNetCore v1 and v2 on disk: found, read and copied, always in the frame of v2.
+"""The CAD models of ShapeNetCore v1 and v2: find, read and copy them, always in the frame of v2.
 
 In v2 the front of a model is -Z, the diagonal of its box is 1 and the origin is its mean vertex. In v1 the
-front is +X and the model lies in a unit cube around the origin: it is turned by +90° about +Y and
-normalised as in v2. The two releases were converted from the source files by different programs, so the
+front is +X and the model lies in a unit cube around the origin: we turn it by +90° about +Y and normalise it
+as in v2. The two releases were converted from the source files by different programs, so the
 mean vertices of one model can differ a little; its box does not. A few models of v1 are mirrored left to
 right, which the box alone cannot tell: use v2, for which Scan2CAD was annotated, if you have the choice.
 """
@@ -22,9 +22,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from raytran.data.atomic import finished_folder
-from raytran.data.shapenet.binvox import read_binvox, write_binvox
-from raytran.data.shapenet.obj import read_obj, replaced_obj
+from raytran.data.files import finished_folder
+from raytran.data.shapenet.meshes import read_binvox, read_obj, replaced_obj, write_binvox
 from raytran.errors import DataError
 
 _log = logging.getLogger(__name__)
@@ -35,7 +34,7 @@ STEM = "model_normalized"
 Version = Literal["v1", "v2"]
 
 V2_FROM_V1 = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-"""Turns v1's front, +X, to v2's, -Z."""
+"""Rotation from v1's axes (front +X) to v2's (front -Z)."""
 
 # Where the categories may lie below the folder that somebody calls ShapeNet: unpacked archives nest.
 _NESTS = (
@@ -80,8 +79,9 @@ def shapenet_version(root: Path) -> Version:
     for nest in _NESTS:
         for category in sorted((root / nest).glob(_CATEGORY)):
             for model in sorted(category.glob("*/")):
-                if (found := _mesh_below(model)) is not None:
-                    return found[1]
+                mesh = _mesh_below(model)
+                if mesh is not None:
+                    return mesh[1]
     packed = sorted(path.name for path in root.glob("*.zip"))
     remedy = f"unpack {packed[0]} there" if packed else "give the folder that holds ShapeNetCore.v2"
     raise DataError(f"no CAD model of ShapeNetCore v1 or v2 lies in {root}; {remedy}")
@@ -93,7 +93,7 @@ def has_model(root: Path, catid: str, model_id: str) -> bool:
 
 
 def categories(root: Path) -> list[str]:
-    """Return the ShapeNet categories of which there may be models, of either release, sorted."""
+    """Return the synsets that have a folder, of either release, sorted; a folder may hold no model."""
     return sorted({folder.name for nest in _NESTS for folder in (root / nest).glob(f"{_CATEGORY}/")})
 
 
@@ -114,7 +114,7 @@ def mesh_path(root: Path, catid: str, model_id: str) -> Path:
     Raises:
         DataError: there is no such file.
     """
-    return _located(root, catid, model_id)[0]
+    return _mesh_of(root, catid, model_id)[0]
 
 
 def model_folder(root: Path, catid: str, model_id: str) -> Path:
@@ -137,7 +137,7 @@ def read_mesh(root: Path, catid: str, model_id: str) -> trimesh.Trimesh:
     Raises:
         DataError: the file is missing, damaged or without faces.
     """
-    path, version = _located(root, catid, model_id)
+    path, version = _mesh_of(root, catid, model_id)
     vertices, faces = read_obj(path)
     if version == "v1":
         vertices = _normalised(vertices, _facts_of_v1(path, vertices))
@@ -150,7 +150,7 @@ def read_facts(root: Path, catid: str, model_id: str) -> ModelFacts:
     Raises:
         DataError: the file is missing or damaged.
     """
-    path, version = _located(root, catid, model_id)
+    path, version = _mesh_of(root, catid, model_id)
     if version == "v1":
         return _facts_of_v1(path, read_obj(path)[0])
     path = path.with_suffix(".json")
@@ -178,7 +178,7 @@ def copy_model(root: Path, catid: str, model_id: str, output_root: Path) -> Path
     Raises:
         DataError: the mesh is missing, damaged or without faces.
     """
-    path, version = _located(root, catid, model_id)
+    path, version = _mesh_of(root, catid, model_id)
     folder = output_root / catid / model_id / "models"
     if folder.is_dir():
         return folder
@@ -194,14 +194,14 @@ def copy_model(root: Path, catid: str, model_id: str, output_root: Path) -> Path
     return folder
 
 
-def _located(root: Path, catid: str, model_id: str) -> tuple[Path, Version]:
-    found = _find_mesh(root, catid, model_id)
-    if found is None:
+def _mesh_of(root: Path, catid: str, model_id: str) -> tuple[Path, Version]:
+    mesh = _find_mesh(root, catid, model_id)
+    if mesh is None:
         raise DataError(
             f"no CAD model {catid}/{model_id} in {root}; "
             "give the folder of ShapeNetCore that holds it, or add it there"
         )
-    return found
+    return mesh
 
 
 def _find_mesh(root: Path, catid: str, model_id: str) -> tuple[Path, Version] | None:
@@ -209,8 +209,9 @@ def _find_mesh(root: Path, catid: str, model_id: str) -> tuple[Path, Version] | 
     if not (_NAME.fullmatch(catid) and _NAME.fullmatch(model_id)):
         return None
     for nest in _NESTS:
-        if (found := _mesh_below(root / nest / catid / model_id)) is not None:
-            return found
+        mesh = _mesh_below(root / nest / catid / model_id)
+        if mesh is not None:
+            return mesh
     return None
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from raytran.rooms.parametric import palette, parts
-from raytran.rooms.parametric.design import Design
+from raytran.rooms.parametric.parts import Design
 
 WHITES = (palette.WHITE, (0.90, 0.88, 0.83), (0.82, 0.88, 0.90))
 """Enamel colours."""

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from raytran.rooms.parametric import palette, parts
-from raytran.rooms.parametric.design import Color, Design
+from raytran.rooms.parametric.parts import Color, Design
 
 GAP = 0.006
 """Gap between neighbouring fronts, metres."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from raytran.rooms.parametric.design import Color
+from raytran.rooms.parametric.parts import Color
 
 WOODS: tuple[Color, ...] = (
     (0.80, 0.64, 0.44),

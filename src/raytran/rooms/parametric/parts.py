@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Closed triangle meshes from which furniture is put together: boxes, cushions, lathed bodies, tubes.
+"""What furniture is made of: coloured, closed triangle meshes such as boxes, cushions, lathed bodies, tubes.
 
 Everything here lives in the object frame of ShapeNet (+Y up, front -Z, metres). Faces are wound outwards, so
 that overlapping parts can be joined by simply listing their faces: their winding numbers add up. Outlines are
@@ -8,13 +8,15 @@ that overlapping parts can be joined by simply listing their faces: their windin
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Vertices = NDArray[np.float64]
+Color = tuple[float, float, float]
 
 
 class Part(NamedTuple):
@@ -22,6 +24,35 @@ class Part(NamedTuple):
 
     vertices: Vertices
     faces: NDArray[np.int64]
+
+
+class ColoredPart(NamedTuple):
+    """A part and its RGB colour in [0, 1]."""
+
+    part: Part
+    color: Color
+
+
+@dataclass
+class Design:
+    """A piece of furniture while it is put together: coloured parts, and the facts that a layout needs.
+
+    Attributes:
+        kind: what a person would call it, e.g. ``office chair``.
+        support: where it stands (see ``CadModel.support``).
+        symmetry: equal turns about +Y through the origin: 1, 2, 4, or 0 for a body of revolution.
+        parts: everything added so far.
+    """
+
+    kind: str
+    support: str = "floor"
+    symmetry: int = 1
+    parts: list[ColoredPart] = field(default_factory=list)
+
+    def add(self, parts: Part | Iterable[Part], color: Color) -> None:
+        """Add one part or several of the same colour."""
+        added = [parts] if isinstance(parts, Part) else parts
+        self.parts.extend(ColoredPart(part, color) for part in added)
 
 
 def loft(rings: ArrayLike, *, closed: bool = False) -> Part:

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from raytran.rooms.parametric import palette, parts
-from raytran.rooms.parametric.design import Color, Design
+from raytran.rooms.parametric.parts import Color, Design
 
 FOOT = 0.08
 """Height of a sofa's feet, metres."""

@@ -10,19 +10,14 @@ from __future__ import annotations
 import csv
 import hashlib
 import io
-import json
 import logging
-import os
-import tempfile
 from dataclasses import asdict, astuple, dataclass, fields
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from raytran.data.atomic import UNFINISHED, sweep, write_text
-from raytran.data.shapenet.models import STEM
+from raytran.data.files import UNFINISHED, sweep, write_text
 from raytran.data.workers import work_on
 from raytran.errors import DataError
 from raytran.rooms.cad import CadModel
@@ -114,7 +109,7 @@ def import_furniture(
     if not paths:
         raise DataError(f"no furniture library (*.sh3f) lies in {source}; give its folder, see docs/data.md")
     output.mkdir(parents=True, exist_ok=True)
-    sweep(output, f"{UNFINISHED}*")
+    sweep(output, f"{UNFINISHED}*", f"*/*/{UNFINISHED}*")
     table, jobs, licences, left_out = read_table(), [], [], dict[str, str]()
     for path in paths:
         with FurnitureLibrary(path) as library:
@@ -161,8 +156,7 @@ def _write_piece(
         credit = Credit(
             f"{catid}/{model_id}", piece.name, piece.creator, piece.licence, library_name, piece_id
         )
-        folder = output / catid / model_id
-        if folder.is_dir():
+        if (output / catid / model_id / "models").is_dir():
             return piece_id, (credit, False)
         try:
             model = _cad_model(library, piece, listed, model_id)
@@ -175,7 +169,7 @@ def _write_piece(
         "split": "val" if piece.creator in held_out else "train",
         "source": asdict(credit),
     }
-    _write_whole(model, extra, folder, output)
+    write_model(model, output, extra=extra)
     return piece_id, (credit, True)
 
 
@@ -202,22 +196,6 @@ def _cad_model(library: FurnitureLibrary, piece: Piece, listed: Listed, model_id
         size_m=size,
         support=kind.support,
     )
-
-
-def _write_whole(model: CadModel, extra: dict[str, Any], folder: Path, output: Path) -> None:
-    """Write a model with what is known beyond its geometry; ``folder`` appears when all of it is there."""
-    with tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=output) as unfinished:
-        files = write_model(model, Path(unfinished))
-        path = files / f"{STEM}.json"
-        facts = json.loads(path.read_text(encoding="ascii"))
-        path.write_text(json.dumps(facts | extra), encoding="ascii")
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            os.replace(files.parent, folder)
-        except OSError:
-            # Another process may have finished the same model meanwhile.
-            if not folder.is_dir():
-                raise
 
 
 def _write_credits(output: Path, rows: list[Credit], licences: list[str]) -> None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from rich.table import Table
 from raytran.checkpoints.checkpoint import load_model, prediction_settings
 from raytran.checkpoints.network import own_packages
 from raytran.checkpoints.weights import shipped_weights
-from raytran.data.atomic import write_json
+from raytran.data.files import SettingsRecord
 from raytran.errors import ConfigError
 from raytran.model import RayTran
 from raytran.run.demo.page import COLUMNS, ShownScene, headline, write_page
@@ -116,13 +115,10 @@ def _data(overrides: Sequence[str], output: Path) -> SceneDataModule:
     wanted = {
         name: value if isinstance(value := cfg[name], str | int) else plain(value) for name in _RECORDED
     }
-    path = output / _RECORD
-    if path.is_file() and json.loads(path.read_text()) != wanted:
+    if SettingsRecord(output / _RECORD).begin(wanted):
         raise ConfigError(
             f"{output} holds a demo with other settings: delete it or give output=ANOTHER_FOLDER"
         )
-    output.mkdir(parents=True, exist_ok=True)
-    write_json(path, wanted)
     return build_data(cfg)
 
 

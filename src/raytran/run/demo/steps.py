@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from raytran.data.atomic import write_json
+from raytran.data.files import write_json
 
 _log = logging.getLogger(__name__)
 

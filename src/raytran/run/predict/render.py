@@ -11,7 +11,7 @@ from PIL import Image
 from torch import Tensor
 
 from raytran.capture.camera_list import CameraList, read_camera_list
-from raytran.data.atomic import finished_folder
+from raytran.data.files import finished_folder
 from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.volumes import places_ahead

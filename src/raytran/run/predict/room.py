@@ -13,10 +13,8 @@ from torch import Tensor
 
 from raytran.capture.sharpness import blurred_frames
 from raytran.data.images import MIN_VIEWS
-from raytran.data.scan import OpenScan
-from raytran.data.scannet.scan import report_dropped, scan_views
-from raytran.data.view_choice import choose_by_coverage
-from raytran.data.views import choose_even
+from raytran.data.scan import OpenScan, report_dropped, scan_views
+from raytran.data.views import choose_by_coverage, choose_even
 from raytran.errors import ConfigError, DataError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid

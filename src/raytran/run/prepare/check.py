@@ -16,7 +16,7 @@ from rich.table import Table
 from raytran.capture.doctor.examine import Examination, examine
 from raytran.capture.doctor.page import summary, write_doctor_page
 from raytran.data.scan2cad import SceneAnnotation, read_annotations
-from raytran.data.scannet.sources import ScanSource, find_scans
+from raytran.data.scannet.find import ScanSource, find_scans
 from raytran.errors import ConfigError, DataError
 from raytran.run.train.build import plain
 

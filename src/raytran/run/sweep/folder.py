@@ -17,7 +17,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from raytran.checkpoints.runs import read_finished
-from raytran.data.atomic import write_json
+from raytran.data.files import write_json
 from raytran.errors import ConfigError
 
 RECORD = "sweep.json"

@@ -12,7 +12,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from raytran.data.atomic import write_text
+from raytran.data.files import write_text
 
 RESULTS = "results.csv"
 FINISHED, FINISHED_BEFORE, FAILED = "finished", "finished before", "failed"

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import signal
 import subprocess
@@ -11,13 +10,12 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import FrameType
-from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from raytran.checkpoints.runs import LAST, read_finished, write_finished
-from raytran.data.atomic import write_json
+from raytran.data.files import SettingsRecord
 from raytran.errors import ConfigError, RaytranError
 from raytran.run.entry import compose, quoted, typed_config_dir, user_environment
 from raytran.run.train.fit import FitResult, train
@@ -123,25 +121,17 @@ def _run(command: Sequence[str]) -> int:
 
 def _record(output_dir: Path, overrides: Sequence[str], stages: Sequence[str]) -> None:
     """Write down the settings of a new curriculum; refuse to continue one that had others."""
-    path = output_dir / RECORD
-    settings = {"overrides": sorted(overrides), "stages": list(stages)}
-    if path.is_file():
-        earlier = _read_record(path)
-        if earlier != settings:
-            typed = " ".join(earlier["overrides"]) or "no overrides"
-            raise ConfigError(
-                f"{output_dir} holds an unfinished curriculum that was started with {typed}: "
-                "give the same to continue it, or resume=none to start a new one"
-            )
+    record = SettingsRecord(output_dir / RECORD)
+    if not record.begin({"overrides": sorted(overrides), "stages": list(stages)}):
         return
-    write_json(path, settings)
-
-
-def _read_record(path: Path) -> dict[str, Any]:
-    try:
-        return dict(json.loads(path.read_text()))
-    except (ValueError, TypeError) as error:
-        raise ConfigError(f"{path} is damaged: delete it and give the same command again") from error
+    earlier = record.read()
+    if "overrides" not in earlier:
+        raise ConfigError(f"{record.path} is damaged: delete it and give the same command again")
+    typed = " ".join(earlier["overrides"]) or "no overrides"
+    raise ConfigError(
+        f"{output_dir} holds an unfinished curriculum that was started with {typed}: "
+        "give the same to continue it, or resume=none to start a new one"
+    )
 
 
 def _preset(overrides: Sequence[str]) -> str:

@@ -22,7 +22,7 @@ from raytran.checkpoints.file import read_checkpoint, read_newest
 from raytran.checkpoints.known_data import KnownData
 from raytran.checkpoints.provenance import provenance
 from raytran.checkpoints.runs import LAST, one_at_a_time, read_finished, write_finished
-from raytran.data.atomic import write_json, write_text
+from raytran.data.files import write_json, write_text
 from raytran.errors import CheckpointError, ConfigError
 from raytran.run.device import cudnn_warning, set_matmul_precision
 from raytran.run.train.build import build_data, build_model, build_module, build_trainer, plain

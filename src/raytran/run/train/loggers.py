@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlparse
 
-from raytran.data.atomic import write_text
+from raytran.data.files import write_text
 from raytran.errors import ConfigError
 from raytran.training.metrics_table import read_table
 

@@ -15,8 +15,8 @@ from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 from PIL import Image
 from scipy.spatial import QhullError
 
-from raytran.data.atomic import finished_folder, no_room
 from raytran.data.collate import collate_scenes
+from raytran.data.files import disk_full, finished_folder
 from raytran.data.views import choose_even
 from raytran.model import inputs_of
 from raytran.pictures.scene_pictures import draw_scene
@@ -56,7 +56,7 @@ class ScenePictures(pl.Callback):
         try:
             pictures = self._draw(found, step, grid_extent)
         except OSError as error:
-            if no_room(error) is None:
+            if disk_full(error) is None:
                 raise
             _log.warning("no pictures of step %d (%s): make room in %s", step, error.strerror, self._folder)
             return

@@ -5,7 +5,7 @@ import numpy as np
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
-from raytran.rooms.collision import Boxes, overlaps
+from raytran.rooms.objects import Boxes, overlaps
 
 
 def random_boxes(rng, count, spread):

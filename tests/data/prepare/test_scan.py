@@ -6,7 +6,7 @@ import pytest
 import torch
 from PIL import Image
 
-from raytran.data.prepare.frames import (
+from raytran.data.prepare.scan import (
     choose_frames,
     encoded_frame,
     frame_names,

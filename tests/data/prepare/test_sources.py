@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from raytran.data.prepare.annotation import Annotations
-from raytran.data.prepare.selection import select_scans
-from raytran.data.scannet.sources import ScanSource
+from raytran.data.prepare.sources import select_scans
+from raytran.data.scannet.find import ScanSource
 from raytran.errors import ConfigError, DataError
 
 ROOT = Path("/scannet")

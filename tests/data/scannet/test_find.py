@@ -11,8 +11,8 @@ import shutil
 import numpy as np
 import pytest
 
+from raytran.data.scannet.find import SOURCE_FORMS, find_scans, read_splits
 from raytran.data.scannet.layout import FORMS
-from raytran.data.scannet.sources import SOURCE_FORMS, find_scans, read_splits
 from raytran.errors import DataError
 
 

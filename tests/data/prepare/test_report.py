@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-from raytran.data.prepare.report_text import PAPER_SCENES, PAPER_VAL_OBJECTS, gigabytes
+from raytran.data.prepare.report import PAPER_SCENES, PAPER_VAL_OBJECTS, gigabytes
 
 
 def test_the_papers_counts():

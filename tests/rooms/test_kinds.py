@@ -4,8 +4,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from raytran.rooms.kinds import KINDS
-from raytran.rooms.sizes import KNOWN_CATIDS, draw_size, guess_kind
+from raytran.rooms.kinds import KINDS, KNOWN_CATIDS, draw_size, guess_kind
 from raytran.structs import CLASS_BY_CATID
 
 EXTENTS = [(1, 1, 1), (2, 1, 0.5), (0.5, 1, 0.4), (0.2, 1, 0.2), (1, 0.2, 0.1), (1, 0.3, 0.8), (0.1, 0.1, 1)]
