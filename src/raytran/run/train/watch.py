@@ -15,7 +15,6 @@ from raytran.training.callbacks.health import Health
 from raytran.training.callbacks.scene_pictures import ScenePictures
 from raytran.training.callbacks.telemetry import Telemetry
 
-REPLAY = "replay.pt"
 PICTURES = "pictures"
 
 
@@ -37,7 +36,7 @@ def watching_callbacks(cfg: DictConfig, run: RunConfig, card: dict[str, Any]) ->
     if not isinstance(pictures, int) or pictures < 0:
         raise ConfigError(f"watch.pictures must be a number of scenes or 0 for none, got {pictures}")
     callbacks: list[pl.Callback] = [
-        Health(folder / REPLAY, max_skipped=max_skipped, card=card),
+        Health(max_skipped=max_skipped),
         Telemetry(card["config"]),
     ]
     if pictures:
