@@ -83,7 +83,9 @@ def test_a_gradient_alone_is_seen_too(fit, make_module, caplog):
 def test_a_run_gives_up_with_the_weights_of_its_last_good_step(fit, make_module):
     module = overflow(make_module("stage2"), 2, 99)
     states = States()
-    with pytest.raises(NonFiniteError, match=r"3 steps in a row were not finite, the last one step 3 \(the loss"):
+    with pytest.raises(
+        NonFiniteError, match=r"3 steps in a row were not finite, the last one step 3 \(the loss"
+    ):
         fit(states, Health(max_skipped=3), module=module, max_steps=20)
     first, *skipped = states.seen
     assert len(skipped) == 3
