@@ -143,7 +143,7 @@ class _Watch(pl.Callback):
         if self._time_after < done <= self._launches_after:
             self.seconds.append(now - self._began)
         self._began = now
-        self.losses.append(pl_module.outcome.losses["total"])
+        self.losses.append(outputs["losses"]["total"])
         if done == self._waits_after:
             self.waits = self._open.enter_context(self._device.waits())
         elif done == self._launches_after:

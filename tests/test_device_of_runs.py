@@ -36,12 +36,10 @@ from raytran.run.evaluate.views import evaluate_views
 from raytran.run.predict.predict import predict_scene
 from raytran.run.predict.render import render_views
 from raytran.run.predict.room import RoomViews, predict_room
-from raytran.run.replay import run_step
 from raytran.run.train.build import build_model, build_module, build_trainer, plain
 from raytran.run.train.settings import RunConfig
 from raytran.structs import SHAPE_SIZE, ObjectSet, SceneBatch, ScenePrediction, Views
 from raytran.training.ranks import agree
-from raytran.training.replay_file import read_replay
 from raytran.training.scores import SceneScores
 
 from .pretend_accelerator import register_with_lightning
@@ -288,7 +286,7 @@ def test_a_run_is_continued(tmp_path):
 
 
 @on_pretend_device
-def test_steps_that_are_not_finite_are_kept_to_be_replayed(tmp_path):
+def test_steps_that_are_not_finite_change_nothing(tmp_path):
     cfg = configured("stage2", "tiny", "watch.pictures=0", "watch.max_skipped=1")
     module = module_of(cfg)
     with torch.no_grad():
@@ -298,16 +296,6 @@ def test_steps_that_are_not_finite_are_kept_to_be_replayed(tmp_path):
         fit(trainer_of(cfg, tmp_path, steps=1), module, [scene_with(targets_of(module.stage))])
     for name, value in module.state_dict().items():
         assert torch.equal(value.cpu(), before[name]), f"{name} has changed in a step that was skipped"
-    _, batches = read_replay(tmp_path / "replay.pt")
-    with kernels_left_out():
-        found = run_step(
-            module.model.to(DEVICE),
-            module.loss,
-            module.stage,
-            [batches[0].to(DEVICE)],
-            autocast=torch.bfloat16,
-        )
-    assert found.parts[0].startswith("heads.occupancy")
 
 
 @pytest.mark.parametrize("experiment", BUDGET)

@@ -21,8 +21,7 @@ LAYERS: list[set[str]] = [
     {"export", "training"},
     {"rooms", "capture", "viewer"},
     {"run"},
-    {"train", "curriculum", "evaluate", "predict", "prepare", "plan", "demo", "replay", "report", "view"}
-    | {"export_model"},
+    {"train", "curriculum", "evaluate", "predict", "prepare", "plan", "demo", "view", "export_model"},
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 WINGS = {"rooms", "capture", "viewer"}

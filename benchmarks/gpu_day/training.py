@@ -22,7 +22,7 @@ from raytran.checkpoints.file import read_newest
 from raytran.checkpoints.runs import LAST, read_finished
 from raytran.run.entry import compose, quoted
 from raytran.run.train.build import build_data
-from raytran.run.train.loggers import read_history
+from raytran.training.loggers import read_history
 
 STAGES = ("stage1", "stage2", "stage3")
 

@@ -75,6 +75,10 @@ class TensorStruct:
         """Return a copy with every tensor inside on ``device``."""
         return self._map(lambda item: item.to(device, non_blocking=non_blocking))
 
+    def detach(self: _Struct) -> _Struct:
+        """Return the same tensors without their autograd graph."""
+        return self._map(lambda item: item.detach())
+
     def pin_memory(self: _Struct) -> _Struct:
         """Return a copy with every tensor inside in page-locked memory (called by ``DataLoader``)."""
         return self._map(lambda item: item.pin_memory())

@@ -54,7 +54,7 @@ def network_of(**parts):
         "_target_": "raytran.model.RayTran",
         "backbone": BACKBONE | parts.get("backbone", {}),
         "heads": {
-            "occupancy": {"_target_": "raytran.heads.occupancy.OccupancyHead", "channels": 16},
+            "occupancy": {"_target_": "raytran.heads.dense.OccupancyHead", "channels": 16},
             "objects": OBJECTS | parts.get("objects", {}),
         },
         "grid_resolution": [6, 6, 4],
@@ -111,7 +111,7 @@ def test_the_baseline_without_attention():
 
 def test_weights_get_their_names_of_today():
     names = {
-        "model.backbone.resnet.conv1.weight": "model.backbone.image_features.encoder.conv1.weight",
+        "model.backbone.encoder.conv1.weight": "model.backbone.image_features.encoder.conv1.weight",
         "model.backbone.projection.bias": "model.backbone.image_features.projection.bias",
         "model.backbone.volume.up.0.grow.weight": "model.backbone.voxel_network.up.0.convolution.weight",
         "model.backbone.volume.down.0.0.bn1.bias": "model.backbone.voxel_network.down.0.0.bn1.bias",

@@ -20,11 +20,7 @@ from raytran.run.entry import entry_point
 from raytran.run.positional import name_positional
 
 COMMAND = re.compile(r"-m raytran\.(\w+)((?:\\\n|[^\n`])*)")
-POSITIONAL = {
-    "report": {"key": "runs", "several": True},
-    "replay": {"key": "file"},
-    "view": {"key": "folder"},
-}
+POSITIONAL = {"view": {"key": "folder"}}
 
 
 def commands(text):
@@ -120,7 +116,7 @@ def test_every_command_has_its_page(project_root):
     ("text", "found"),
     [
         ("`python -m raytran.train seed=1`, and", [("train", ("seed=1",))]),
-        ("python -m raytran.report RUN RUN …   # both", [("report", ("RUN", "RUN"))]),
+        ("python -m raytran.view PREDICTION   # in the browser", [("view", ("PREDICTION",))]),
         (
             "-m raytran.evaluate a=x|y \\\n  [b=c]",
             [("evaluate", ("a=x", "b=c")), ("evaluate", ("a=y", "b=c"))],

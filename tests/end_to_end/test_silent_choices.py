@@ -18,7 +18,7 @@ from raytran.errors import CheckpointError, DataError
 from raytran.run.entry import compose
 from raytran.run.export.export_model import export_model
 from raytran.run.train.fit import RANDOM_ENCODER, train
-from raytran.run.train.loggers import read_history
+from raytran.training.loggers import read_history
 
 ONE_STEP = ["trainer.max_steps=1", "trainer.val_check_interval=1", "watch.pictures=0"]
 

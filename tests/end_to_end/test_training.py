@@ -22,7 +22,7 @@ from raytran.ops.triton import block_pairs
 from raytran.run.entry import compose
 from raytran.run.train.curriculum import run_curriculum
 from raytran.run.train.fit import train
-from raytran.run.train.loggers import read_history
+from raytran.training.loggers import read_history
 
 
 @pytest.fixture(scope="module")

@@ -51,8 +51,6 @@ def test_the_wheel_is_what_runs(site: Path, tmp_path: Path) -> None:
         "predict",
         "prepare",
         "demo",
-        "replay",
-        "report",
         "export_model",
         "view",
     ],
@@ -79,7 +77,7 @@ def test_rooms_are_made_where_the_user_is(site: Path, tmp_path: Path) -> None:
     assert (tmp_path / "rooms" / "scan2cad" / "full_annotations.json").is_file()
 
 
-@pytest.mark.parametrize("name", ["report.html.j2", "runs.html.j2", "doctor.html.j2", "page.css"])
+@pytest.mark.parametrize("name", ["report.html.j2", "doctor.html.j2", "page.css"])
 def test_the_page_templates_are_inside(name: str, site: Path) -> None:
     assert (site / "raytran" / "view" / "templates" / name).is_file()
 

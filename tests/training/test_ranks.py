@@ -20,7 +20,7 @@ from raytran.data.collate import collate_scenes
 from raytran.run.entry import compose
 from raytran.run.train.build import build_model, build_module
 from raytran.structs import ObjectSet
-from raytran.training.callbacks.rank_agreement import RankAgreement
+from raytran.training.callbacks.run_checks import RankAgreement
 from raytran.training.callbacks.stage_setup import StageSetup
 from raytran.training.ranks import (
     BatchNorm1dOverRanks,

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor, nn
@@ -13,30 +12,8 @@ from torch.nn.modules.batchnorm import _BatchNorm
 
 from raytran.losses.matcher import HungarianMatcher
 from raytran.losses.objects import Match
-from raytran.structs import PADDING, ObjectSet, RawObjects, RawScene
+from raytran.structs import PADDING, ObjectSet, RawObjects
 from raytran.training.ranks import mean_over_ranks
-
-
-@dataclass(frozen=True)
-class StepOutcome:
-    """What the last forward pass gave.
-
-    Attributes:
-        losses: terms and ``total``, means over the ranks, without a graph.
-        objects: the last decoder layer's, float32 without a graph; None if the stage has no objects.
-    """
-
-    losses: dict[str, Tensor]
-    objects: RawObjects | None
-
-    @staticmethod
-    def of(losses: dict[str, Tensor], raw: RawScene) -> StepOutcome:
-        """Return what callbacks need of a forward pass."""
-        if raw.objects is None:
-            return StepOutcome(losses, None)
-        last = raw.objects[-1]
-        exact = {field.name: getattr(last, field.name).detach().float() for field in fields(last)}
-        return StepOutcome(losses, RawObjects(**exact))
 
 
 def gradient_norms(model: nn.Module) -> dict[str, Tensor]:
@@ -63,6 +40,7 @@ def slot_signals(
         ``slots_used``: share of the slots that say they hold an object. It should come to the mean number of
         objects over that of slots; 0 for long, the padding class has won.
     """
+    objects = RawObjects(**{name: value.float() for name, value in vars(objects).items()})
     right, matched = _count_right(objects, targets, matcher(objects, targets))
     log_probability = objects.class_logits.log_softmax(dim=-1)
     entropy = -(log_probability.exp() * log_probability).sum(dim=-1) / math.log(PADDING + 1)

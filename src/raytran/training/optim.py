@@ -53,5 +53,9 @@ class Optimization:
         )
         return {
             "optimizer": optimizer,
-            "lr_scheduler": {"scheduler": LambdaLR(optimizer, factor), "interval": "step"},
+            "lr_scheduler": {
+                "scheduler": LambdaLR(optimizer, factor),
+                "interval": "step",
+                "name": "schedule/learning_rate",  # by which Lightning's LearningRateMonitor logs it
+            },
         }

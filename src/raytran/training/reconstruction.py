@@ -13,7 +13,6 @@ from torchmetrics import MeanMetric
 from raytran.losses.total import TotalLoss
 from raytran.model import RayTran, inputs_of
 from raytran.structs import RawScene, SceneBatch
-from raytran.training.health_signals import StepOutcome
 from raytran.training.optim import Optimization
 from raytran.training.ranks import mean_over_ranks
 from raytran.training.scores import SceneScores
@@ -30,9 +29,6 @@ class Reconstruction(pl.LightningModule):
         optimization: optimiser and schedule.
         compiled: run the model through ``torch.compile``. What is compiled is the function, not the module,
             so that weights keep their names.
-
-    Attributes:
-        outcome: what the last training step gave, for callbacks.
     """
 
     def __init__(
@@ -51,18 +47,25 @@ class Reconstruction(pl.LightningModule):
         self.optimization = optimization
         self.scores = SceneScores(tasks=stage.tasks)
         self._compiled = torch.compile(model.forward) if compiled else None
-        self.outcome: StepOutcome | None = None
         self._val_losses: dict[str, MeanMetric] = {}
 
-    def training_step(self, batch: SceneBatch, batch_idx: int) -> Tensor:
-        """Return the loss to minimise; log its terms, means over all ranks."""
+    def training_step(self, batch: SceneBatch, batch_idx: int) -> dict[str, Any]:
+        """Run the network on a batch and log the terms of the loss, means over all ranks.
+
+        Returns:
+            ``loss``: the scalar to minimise.
+            ``losses``: terms and ``total``, means over the ranks, without a graph.
+            ``objects``: the last decoder layer's ``RawObjects`` without a graph; None in stages without them.
+            Lightning hands all of it to the callbacks' ``on_train_batch_end``.
+        """
         raw = self._run_model(batch)
         losses = self._losses(raw, batch, mean_over_ranks=mean_over_ranks)
         means = mean_over_ranks(torch.stack([value.detach() for value in losses.values()]))
-        self.outcome = StepOutcome.of(dict(zip(losses, means, strict=True)), raw)
-        for name, value in self.outcome.losses.items():
+        logged = dict(zip(losses, means, strict=True))
+        for name, value in logged.items():
             self.log(f"train/{name}", value, prog_bar=name == "total")
-        return losses["total"]
+        objects = None if raw.objects is None else raw.objects[-1].detach()
+        return {"loss": losses["total"], "losses": logged, "objects": objects}
 
     def validation_step(self, batch: SceneBatch, batch_idx: int) -> None:
         """Collect the losses and the scores, in float32 also under autocast."""

@@ -15,8 +15,8 @@ from raytran.pictures.curves import draw_curves
 from raytran.pictures.panels import contact_sheet, draw_frames, draw_masks, draw_occupancy
 from raytran.pictures.report import Picture, Report, Section, SplitScores, write_report
 from raytran.run.train.fit import FitResult
-from raytran.run.train.loggers import read_history
 from raytran.structs import SceneBatch, ScenePrediction
+from raytran.training.loggers import read_history
 
 COLUMNS = {
     "train": "training rooms",

@@ -90,7 +90,7 @@ def last_value(folder: Path, metric: str) -> tuple[float | None, list[str]]:
         metric: its name, e.g. ``val/occupancy/iou``.
     """
     # Imported here so that commands which sweep nothing, --help above all, answer at once.
-    from raytran.run.train.loggers import read_history
+    from raytran.training.loggers import read_history
 
     names: set[str] = set()
     for run in [folder, *_stages(folder)]:

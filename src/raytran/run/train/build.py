@@ -9,24 +9,23 @@ from typing import TYPE_CHECKING, Any
 import lightning.pytorch as pl
 import torch
 from hydra.utils import instantiate
-from lightning.pytorch.callbacks import TQDMProgressBar
+from lightning.pytorch.callbacks import LearningRateMonitor, TQDMProgressBar
 from omegaconf import DictConfig, OmegaConf
 
 from raytran.checkpoints.runs import LAST
 from raytran.checkpoints.weights import without_sources
 from raytran.errors import ConfigError
-from raytran.run.train.loggers import METRICS
 from raytran.run.train.settings import RunConfig
-from raytran.run.train.watch import watching_callbacks
-from raytran.training.callbacks.effective_batch import EffectiveBatch
+from raytran.training.callbacks.health import Health
 from raytran.training.callbacks.last_checkpoint import LastCheckpoint
-from raytran.training.callbacks.rank_agreement import RankAgreement
-from raytran.training.callbacks.repeated_frames import RepeatedFramesWarning
+from raytran.training.callbacks.run_checks import EffectiveBatch, RankAgreement, RepeatedFramesWarning
+from raytran.training.callbacks.scene_pictures import ScenePictures
 from raytran.training.callbacks.stage_setup import StageSetup
 from raytran.training.callbacks.step_progress import StepProgress
+from raytran.training.callbacks.telemetry import RunSettings, Telemetry
 from raytran.training.checkpoint_io import AtomicCheckpointIO
 from raytran.training.datamodule import SceneDataModule
-from raytran.training.metrics_table import MetricsTable
+from raytran.training.loggers import METRICS, MetricsTable
 from raytran.training.ranks import SyncedBatchNorm
 from raytran.training.reconstruction import Reconstruction
 
@@ -112,7 +111,7 @@ def build_trainer(cfg: DictConfig, run: RunConfig, card: dict[str, Any]) -> pl.T
         RankAgreement(),
         RepeatedFramesWarning(),
         LastCheckpoint(folder / LAST, every_n_steps=run.checkpoint_every, card=card),
-        *watching_callbacks(cfg, run, card),
+        *_monitors(cfg, folder, card["config"]),
     ]
     if run.progress_bar == "rich":
         callbacks.append(StepProgress(f"stage {card['stage']}"))
@@ -128,3 +127,19 @@ def build_trainer(cfg: DictConfig, run: RunConfig, card: dict[str, Any]) -> pl.T
         enable_progress_bar=run.progress_bar == "tqdm",
         _convert_="all",
     )
+
+
+def _monitors(cfg: DictConfig, folder: Path, settings: dict[str, Any]) -> list[pl.Callback]:
+    """Return the callbacks that log how a run goes; of these Health alone acts, by skipping steps."""
+    max_skipped, pictures = cfg.watch.max_skipped, cfg.watch.pictures
+    if not isinstance(max_skipped, int) or max_skipped < 1:
+        raise ConfigError(f"watch.max_skipped must be a number of steps, at least 1, got {max_skipped}")
+    if not isinstance(pictures, int) or pictures < 0:
+        raise ConfigError(f"watch.pictures must be a number of scenes or 0 for none, got {pictures}")
+    monitors = [
+        Health(max_skipped=max_skipped),
+        Telemetry(),
+        LearningRateMonitor(),
+        RunSettings(settings, metric=cfg.get("optimized_metric")),
+    ]
+    return [*monitors, ScenePictures(folder / "pictures", scenes=pictures)] if pictures else monitors

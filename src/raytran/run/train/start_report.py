@@ -71,8 +71,8 @@ def start_report(
     own = own_packages(card["model"])
     if not set(own) <= set(trust):
         lines.append(
-            f"this network has classes of {', '.join(own)}: to use its checkpoints, evaluate, predict, "
-            f"export_model and replay need trust=[{','.join(own)}]"
+            f"this network has classes of {', '.join(own)}: to use its checkpoints, evaluate, predict "
+            f"and export_model need trust=[{','.join(own)}]"
         )
     return lines
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a run costs: time of a step, scenes a second, memory; and the learning rate it goes by."""
+"""What a run costs: seconds of a step, scenes per second, memory; its settings and its final score."""
 
 from __future__ import annotations
 
@@ -11,42 +11,40 @@ from typing import Any
 
 import lightning.pytorch as pl
 import torch
+from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 
 _GB = 1e9
 _MAXRSS_UNIT = 1 if sys.platform == "darwin" else 1024
 
+HP_METRIC = "hp_metric"
+"""Name under which TensorBoard's table of settings expects the score of a run."""
+
 
 class Telemetry(pl.Callback):
-    """Logs where the losses are logged; hands the run's settings to the loggers that keep such.
+    """Logs time and memory at the steps at which the losses are logged.
 
     ``time/compute`` seconds of a step from the batch's arrival to the weights' change, mean over the steps
-    since the last logging; ``time/data`` what lies between, nearly all of it waiting for data (logging and
+    since the last logging; ``time/data`` the time between two steps, mostly waiting for data (logging and
     the writing of checkpoints are in it too, validations are not); ``time/scenes_per_second`` of all ranks;
-    ``memory/process`` and ``memory/gpu``, the highest use so far of the first rank, GB;
-    ``schedule/learning_rate``.
-
-    Args:
-        settings: of the run, plain Python.
+    ``memory/process`` and ``memory/gpu``, the highest use so far of the first rank, GB. Lightning's
+    ``ThroughputMonitor`` would make the host wait for the device once more in every step, and its
+    ``DeviceStatsMonitor`` logs some 150 columns.
     """
 
-    def __init__(self, settings: Mapping[str, Any]) -> None:
-        self._settings = dict(settings)
+    def __init__(self) -> None:
         self._ended: float | None = None
         self._began = 0.0
-        self._data = 0.0
-        self._compute = 0.0
-        self._scenes = 0
-        self._batches = 0
+        self._restart()
 
-    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Say what is being run."""
-        for logger in trainer.loggers:
-            logger.log_hyperparams(self._settings)
+    def _restart(self) -> None:
+        """Begin new means."""
+        self._data = self._compute = 0.0
+        self._scenes = self._batches = 0
 
     def on_train_batch_start(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, batch: Any, batch_idx: int
     ) -> None:
-        """Take the time at which data are there."""
+        """Take the time at which the batch is there."""
         self._began = time.perf_counter()
 
     def on_train_batch_end(
@@ -61,25 +59,52 @@ class Telemetry(pl.Callback):
             self._batches += 1
         self._ended = now
         ends_step = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
-        if ends_step and trainer._logger_connector.should_update_logs:
-            self._log(trainer, pl_module)
+        if ends_step and trainer.global_step % trainer.log_every_n_steps == 0:
+            pl_module.log_dict(self._values(pl_module.device, trainer.accumulate_grad_batches))
+            self._restart()
 
     def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Leave the validation, and all that other callbacks do after it, out of the next step's time."""
         self._ended = None
 
-    def _log(self, trainer: pl.Trainer, module: pl.LightningModule) -> None:
-        values = {
-            "schedule/learning_rate": trainer.optimizers[0].param_groups[0]["lr"],
-            "memory/process": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _MAXRSS_UNIT / _GB,
-        }
-        if module.device.type == "cuda":
-            values["memory/gpu"] = torch.cuda.max_memory_allocated(module.device) / _GB
+    def _values(self, device: torch.device, batches_per_step: int) -> dict[str, float]:
+        values = {"memory/process": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * _MAXRSS_UNIT / _GB}
+        if device.type == "cuda":
+            values["memory/gpu"] = torch.cuda.max_memory_allocated(device) / _GB
         if self._batches:
-            steps = self._batches / trainer.accumulate_grad_batches
+            steps = self._batches / batches_per_step
             values["time/data"] = self._data / steps
             values["time/compute"] = self._compute / steps
             values["time/scenes_per_second"] = self._scenes / (self._data + self._compute)
-        self._data = self._compute = 0.0
-        self._scenes = self._batches = 0
-        module.log_dict(values)
+        return values
+
+
+class RunSettings(pl.Callback):
+    """Hands a run's settings to its loggers, and at the end the score that runs are compared by.
+
+    TensorBoard's table of settings (HPARAMS) needs both at once, so it gets the settings with the score.
+
+    Args:
+        settings: of the run, plain Python.
+        metric: name of a logged value, e.g. ``val/objects/accuracy_class``: its last one is the score; None: there is none.
+    """
+
+    def __init__(self, settings: Mapping[str, Any], *, metric: str | None) -> None:
+        self._settings = dict(settings)
+        self._metric = metric
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Log the settings."""
+        for logger in trainer.loggers:
+            if not isinstance(logger, TensorBoardLogger):
+                logger.log_hyperparams(self._settings)
+
+    def on_train_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Log the score as ``hp_metric``, if the metric was ever logged."""
+        score = None if self._metric is None else trainer.callback_metrics.get(self._metric)
+        for logger in trainer.loggers:
+            if isinstance(logger, TensorBoardLogger):
+                scores = {} if score is None else {HP_METRIC: float(score)}
+                logger.log_hyperparams(self._settings, scores, step=trainer.global_step)
+            elif isinstance(logger, WandbLogger) and score is not None:
+                logger.experiment.summary[HP_METRIC] = float(score)

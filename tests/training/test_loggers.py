@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import pytest
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from raytran.training.loggers import (
+    WANDB_ID,
+    MetricsTable,
+    group_and_job,
+    read_history,
+    tensorboard_logger,
+    wandb_logger,
+)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "run" / "metrics.csv"
+
+
+def log(table, *entries):
+    for step, metrics in entries:
+        table.log_metrics(metrics, step=step)
+        table.save()
+
+
+def rows(path):
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_rows_are_there_at_once_and_columns_may_come_later(path):
+    table = MetricsTable(path)
+    log(table, (0, {"a": 1.0, "epoch": 0}), (1, {"a": 0.1 + 0.2}))
+    log(table, (1, {"b": 3.0}), (2, {"a": 4.0, "b": 5.0}))
+    assert read_history(path.parent) == {"a": [(0, 1.0), (1, 0.1 + 0.2), (2, 4.0)], "b": [(1, 3.0), (2, 5.0)]}
+    assert rows(path)[0] == {"step": "0", "epoch": "0", "a": "1.0", "b": ""}
+
+
+def test_a_resumed_run_goes_on_without_rows_that_come_twice(path):
+    whole, stopped = MetricsTable(path), MetricsTable(path.with_name("stopped.csv"))
+    entries = [(step, {"a": 1.0 / (step + 1)}) for step in range(6)]
+    entries.insert(4, (3, {"val": 7.0}))
+    log(whole, *entries)
+    log(stopped, *entries[:6])  # steps 0 to 4; the checkpoint is of three steps
+    resumed = MetricsTable(stopped.path)
+    resumed.continue_from(3)
+    log(resumed, *entries[3:])
+    assert stopped.path.read_text() == path.read_text()
+
+
+def test_a_new_run_starts_anew(path):
+    log(MetricsTable(path), (0, {"a": 1.0}))
+    table = MetricsTable(path)
+    table.continue_from(0)
+    assert rows(path) == []
+
+
+def test_a_line_cut_short_by_a_kill_is_left_out(path):
+    log(MetricsTable(path), (0, {"a": 1.0}), (1, {"a": 2.0}))
+    path.write_text(path.read_text()[:-2])
+    resumed = MetricsTable(path)
+    resumed.continue_from(2)
+    log(resumed, (2, {"a": 3.0}))
+    assert read_history(path.parent) == {"a": [(0, 1.0), (2, 3.0)]}
+
+
+def test_a_full_disk_delays_rows(path, monkeypatch, caplog):
+    table = MetricsTable(path)
+    log(table, (0, {"a": 1.0}))
+    with monkeypatch.context() as context:
+
+        def refuse(*_, **__):
+            raise OSError(28, "No space left on device")
+
+        context.setattr(Path, "open", refuse)
+        log(table, (1, {"a": 2.0}), (2, {"a": 3.0}))
+    assert caplog.text.count("No space left on device): make room there; training goes on") == 1
+    log(table, (3, {"a": 4.0}))
+    assert read_history(path.parent)["a"] == [(0, 1.0), (1, 2.0), (2, 3.0), (3, 4.0)]
+
+
+def test_no_table_is_an_empty_history(path):
+    assert read_history(path.parent) == {}
+
+
+def log_to_tensorboard(folder, values, continue_from=None):
+    logger = tensorboard_logger(save_dir=str(folder))
+    if continue_from is not None:
+        logger.save()  # as Lightning does at the start, before the run is known to continue
+        logger.continue_from(continue_from)
+    for step, value in values.items():
+        logger.log_metrics({"train/total": value}, step=step)
+    logger.finalize("success")
+
+
+def test_tensorboard_shows_steps_done_twice_once(tmp_path):
+    log_to_tensorboard(tmp_path, {0: 9.0, 1: 8.0, 2: 7.0, 3: 6.0})
+    log_to_tensorboard(tmp_path, {2: 7.5, 3: 6.5, 4: 5.5}, continue_from=2)
+    assert {path.parent for path in tmp_path.rglob("events.out.tfevents.*")} == {tmp_path / "tensorboard"}
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload().Scalars("train/total")
+    assert [(event.step, event.value) for event in events] == [
+        *((0, 9.0), (1, 8.0)),
+        *((2, 7.5), (3, 6.5), (4, 5.5)),
+    ]
+
+
+@pytest.fixture
+def no_wandb_settings(monkeypatch, tmp_path):
+    for name in ("WANDB_API_KEY", "WANDB_IDENTITY_TOKEN_FILE", "WANDB_MODE", "WANDB_BASE_URL"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("NETRC", str(tmp_path / "netrc"))
+
+
+@pytest.mark.usefixtures("no_wandb_settings")
+def test_wandb_is_offline_without_a_key(tmp_path):
+    assert wandb_logger(project="p", name="n", save_dir=str(tmp_path))._offline
+
+
+@pytest.mark.usefixtures("no_wandb_settings")
+@pytest.mark.parametrize("place", ["environment", "netrc"])
+def test_wandb_is_online_with_a_key(tmp_path, monkeypatch, place):
+    if place == "environment":
+        monkeypatch.setenv("WANDB_API_KEY", "x" * 40)
+    else:
+        (tmp_path / "netrc").write_text("machine api.wandb.ai login user password key")
+    logger = wandb_logger(project="p", name="n", save_dir=str(tmp_path))
+    assert not logger._offline
+    assert logger._wandb_init["resume"] == "allow"
+
+
+@pytest.mark.usefixtures("no_wandb_settings")
+def test_a_resumed_run_is_the_same_run(tmp_path):
+    first = wandb_logger(project="p", name="n", save_dir=str(tmp_path / "a"))
+    again = wandb_logger(project="p", name="n", save_dir=str(tmp_path / "a"))
+    other = wandb_logger(project="p", name="n", save_dir=str(tmp_path / "b"))
+    assert first.version == again.version == (tmp_path / "a" / WANDB_ID).read_text().strip()
+    assert other.version != first.version
+
+
+def test_runs_of_a_sweep_or_a_curriculum_are_a_group(tmp_path):
+    (tmp_path / "sweeps" / "monday").mkdir(parents=True)
+    job = tmp_path / "sweeps" / "monday" / "0" / "stage1"
+    assert group_and_job(job) == (None, "")
+    (tmp_path / "sweeps" / "monday" / "0").mkdir()
+    (tmp_path / "sweeps" / "monday" / "0" / "curriculum.json").touch()
+    assert group_and_job(job) == ("monday 0", "stage1")
+    (tmp_path / "sweeps" / "monday" / "sweep.json").touch()
+    assert group_and_job(job) == ("sweeps monday", "0/stage1")
