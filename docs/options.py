@@ -164,7 +164,7 @@ def _is_of(name: str, experiment: Path) -> bool:
 def _presets_table(_: str) -> list[str]:
     found = {path.stem: options(f"preset/{path.stem}") for path in (CONF / "preset").glob("*.yaml")}
     columns = {name: {option.name: option for option in listed} for name, listed in found.items()}
-    names = sorted(columns, key=lambda name: -int(columns[name]["schedule.occupancy.steps"].value or 0))
+    names = sorted(columns, key=lambda name: -int(columns[name]["schedule.stage1.steps"].value or 0))
     rows = ["| setting | " + " | ".join(f"`preset={name}`" for name in names) + " | |"]
     rows.append("|---" * (len(names) + 2) + "|")
     for option in columns[names[0]].values():

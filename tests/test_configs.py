@@ -128,7 +128,7 @@ def test_the_papers_preset_is_the_default_of_the_code():
 
 def test_the_papers_numbers():
     config = train_config("preset=raytran", "trainer=ddp", "precision=16-mixed", "experiment=stage2")
-    assert [config.schedule[stage].steps for stage in ("occupancy", "joint", "shape")] == [
+    assert [config.schedule[stage].steps for stage in ("stage1", "stage2", "stage3")] == [
         224000,
         239000,
         5000,

@@ -53,7 +53,7 @@ def test_the_step_can_be_done_again(lost, capsys):
     assert found.parts[0].startswith("backbone.")
     assert not torch.tensor(found.losses["total"]).isfinite()
     said = capsys.readouterr().out
-    assert "step 3 of stage occupancy" in said
+    assert "step 3 of stage1" in said
     assert f"not finite in the forward pass, in order: {found.parts[0]}" in said
 
 

@@ -64,7 +64,7 @@ def run(name: str, iou: float, rate: float, **history) -> RunRecord:
         "val/total": [(199, 1 - iou)],
     }
     settings = {"optimizer.learning_rate": rate, "seed": 0}
-    return RunRecord(name, logged | history, settings, {"stage": "joint", "steps": "200"})
+    return RunRecord(name, logged | history, settings, {"stage": "stage2", "steps": "200"})
 
 
 @pytest.fixture
@@ -86,7 +86,7 @@ def test_numbers_and_settings_side_by_side(page):
     assert "1 more are the same" in page.text
     assert not any(row[0] == "seed" for row in page.rows)
     assert page.best == ["0.500", "0.500", "0.500"], "two scores and the loss of c are the better ones"
-    assert page.row("a <b>") == ["a <b>", "joint", "200"]
+    assert page.row("a <b>") == ["a <b>", "stage2", "200"]
     assert "d is left out." in page.text
 
 

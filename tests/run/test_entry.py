@@ -85,4 +85,4 @@ def test_help_names_the_settings_without_loading_torch(command, tmp_path):
 
 def test_compose_is_what_the_command_line_would_compose():
     cfg = compose("train", ["preset=tiny", "experiment=stage2", "output_dir=x"])
-    assert (cfg.preset, cfg.stage.name, cfg.output_dir) == ("tiny", "joint", "x")
+    assert (cfg.preset, cfg.stage.name, cfg.output_dir) == ("tiny", "stage2", "x")

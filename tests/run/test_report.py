@@ -20,7 +20,7 @@ TABLE = """step,epoch,train/total,time/data,time/compute,time/scenes_per_second,
 CONFIG = """preset: tiny
 seed: {seed}
 output_dir: /somewhere/{seed}
-stage: {{name: joint}}
+stage: {{name: stage2}}
 trainer: {{max_steps: 10}}
 """
 
@@ -42,12 +42,12 @@ def test_runs_below_a_folder_are_found_once(tmp_path):
 def test_what_is_said_of_a_run(tmp_path):
     write_run(tmp_path / "sweep" / "a")
     done = write_run(tmp_path / "sweep" / "b" / "stage2", seed=1)
-    write_finished(done, stage="joint", preset="tiny", experiment="stage2", steps=4)
+    write_finished(done, stage="stage2", preset="tiny", experiment="stage2", steps=4)
     (a, b), notes = read_runs(find_runs([tmp_path / "sweep"]))
     assert notes == []
     assert (a.name, b.name) == ("a", "b/stage2")
     assert a.facts == {
-        "stage": "joint",
+        "stage": "stage2",
         "preset": "tiny",
         "steps": "4 of 10",
         "state": "not finished",
@@ -60,7 +60,7 @@ def test_what_is_said_of_a_run(tmp_path):
     }
     assert b.facts["steps"] == "4"
     assert b.facts["state"].startswith("finished 20")
-    assert a.settings == {"preset": "tiny", "seed": 0, "stage.name": "joint", "trainer.max_steps": 10}
+    assert a.settings == {"preset": "tiny", "seed": 0, "stage.name": "stage2", "trainer.max_steps": 10}
 
 
 def test_time_is_that_of_all_steps():

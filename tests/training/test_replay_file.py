@@ -11,7 +11,7 @@ from raytran.errors import CheckpointError
 from raytran.structs import ObjectSet
 from raytran.training.replay_file import read_replay, write_replay
 
-CARD = {"format": "raytran.checkpoint/1", "stage": "joint", "preset": "tiny", "model": {}, "views": {}}
+CARD = {"format": "raytran.checkpoint/1", "stage": "stage2", "preset": "tiny", "model": {}, "views": {}}
 
 
 def write(path, batches):

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,9 @@ from torch import Tensor
 from raytran.errors import CheckpointError
 
 FORMAT = "raytran.checkpoint/1"
+
+STAGE_NAMES = {"occupancy": "stage1", "joint": "stage2", "shape": "stage3", "view": "novel_view"}
+"""What the stages were called in earlier checkpoints, and are called now."""
 
 _REQUIRED = {"stage": str, "preset": str, "model": dict, "views": dict, "state_dict": dict}
 
@@ -43,3 +47,27 @@ def check_content(content: Any, path: Path) -> None:
         isinstance(name, str) and isinstance(value, Tensor) for name, value in content["state_dict"].items()
     ):
         raise CheckpointError(f"{path} is no checkpoint of raytran: some of its weights are no tensors")
+
+
+def with_stage_names(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``content`` with its stages under the names they have now, see ``STAGE_NAMES``."""
+    renamed = dict(content)
+    renamed["stage"] = _stage_name(content["stage"])
+    for name, keys in (("parent", ["stage"]), ("config", ["stage", "schedule"])):
+        if isinstance(part := content.get(name), Mapping):
+            renamed[name] = {key: _stage_name(value) if key in keys else value for key, value in part.items()}
+    return renamed
+
+
+def _stage_name(said: Any) -> Any:
+    """Return what names stages with their present names: a name, a list of names, or settings by name."""
+    if isinstance(said, str):
+        return STAGE_NAMES.get(said, said)
+    if isinstance(said, Mapping):
+        return {
+            STAGE_NAMES.get(key, key): _stage_name(value)
+            if key in ("name", "parent", "other_parents")
+            else value
+            for key, value in said.items()
+        }
+    return [_stage_name(name) for name in said] if isinstance(said, list | tuple) else said

@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 
-from raytran.checkpoints.content import DamagedCheckpointError, check_content
+from raytran.checkpoints.content import DamagedCheckpointError, check_content, with_stage_names
 from raytran.checkpoints.weights_file import is_weights_file, read_weights
 from raytran.errors import CheckpointError
 
@@ -95,7 +95,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
             ".ckpt or .safetensors file that it was made from"
         )
     if is_weights_file(path):
-        return read_weights(path)
+        return with_stage_names(read_weights(path))
     _check_bytes(path)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
@@ -107,7 +107,7 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
     except Exception as error:  # a made-up file can fail anywhere in the reader
         raise _damaged(path) from error
     check_content(content, path)
-    return content
+    return with_stage_names(content)
 
 
 def read_newest(folder: Path) -> tuple[Path, dict[str, Any]] | None:

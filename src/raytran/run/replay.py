@@ -72,7 +72,7 @@ def replay(cfg: DictConfig) -> Replayed:
     scenes = ", ".join(scene for batch in batches for scene in batch.scene_id)
     step = content.get("global_step")
     scaled = "" if scale is None else f", loss times {scale:g}"
-    _show(found, f"step {step} of stage {stage.name}, scenes {scenes}, {precision} on {device.type}{scaled}")
+    _show(found, f"step {step} of {stage.name}, scenes {scenes}, {precision} on {device.type}{scaled}")
     return found
 
 

@@ -43,16 +43,16 @@ def test_the_parent_is_named_with_its_score():
     cfg = compose("train", ["preset=tiny", "experiment=stage2", "output_dir=unused"])
     module = build_module(cfg, build_model(cfg))
     scores = {"val/occupancy/iou": 0.41234, "val/total": 3.0}
-    parent = {"path": "a/last.ckpt", "stage": "occupancy", "step": 1500, "scores": scores}
+    parent = {"path": "a/last.ckpt", "stage": "stage1", "step": 1500, "scores": scores}
     last = start_report(module.stage, module.model, card(cfg, parent))[-1]
-    assert last == "starts from stage occupancy, step 1500, val/occupancy/iou 0.412: a/last.ckpt"
+    assert last == "starts from stage1, step 1500, val/occupancy/iou 0.412: a/last.ckpt"
 
 
 def test_a_parent_on_other_data_is_said_in_one_line():
     typed = ["preset=tiny", "experiment=stage2", "output_dir=unused"]
     cfg = compose("train", [*typed, "data=scan2cad", "data.root=real"])
     module = build_module(cfg, build_model(cfg))
-    parent = {"path": "a/last.ckpt", "stage": "occupancy", "step": 1500, "scores": {}}
+    parent = {"path": "a/last.ckpt", "stage": "stage1", "step": 1500, "scores": {}}
     rooms = KnownData.of_config(plain(compose("train", [*typed, "data.root=rooms"]))).as_plain()
     line = "its parent was trained on other data, rooms in rooms; this run on scan2cad in real"
     assert line in start_report(module.stage, module.model, card(cfg, parent | {"data": rooms}))

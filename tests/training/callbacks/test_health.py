@@ -14,7 +14,7 @@ from raytran.errors import NonFiniteError
 from raytran.training.callbacks.health import Health
 from raytran.training.replay_file import read_replay
 
-CARD = {"format": "raytran.checkpoint/1", "stage": "joint", "preset": "tiny", "model": {}, "views": {}}
+CARD = {"format": "raytran.checkpoint/1", "stage": "stage2", "preset": "tiny", "model": {}, "views": {}}
 
 
 def overflow(module, first, last, call="conv1"):
@@ -99,7 +99,7 @@ def test_a_run_gives_up_and_keeps_its_last_batches(fit, make_module, batch, tmp_
         fit(Health(path, max_skipped=3, card=CARD), Start(), module=module, max_steps=20)
     content, batches = read_replay(path)
     assert content["global_step"] == 3
-    assert (content["stage"], content["replay"]["precision"]) == ("joint", "32-true")
+    assert (content["stage"], content["replay"]["precision"]) == ("stage2", "32-true")
     assert content["replay"]["scale"] is None
     assert torch.equal(batches[0].views.images, batch.views.images)
     assert torch.equal(batches[0].objects[0].shape, batch.objects[0].shape)

@@ -62,7 +62,7 @@ def start_report(
         told = [
             f"{name} {value:.3g}" for name, value in scores.items() if name == f"val/{stage.parent_score}"
         ]
-        at = f"stage {parent['stage']}, step {parent['step']}"
+        at = f"{parent['stage']}, step {parent['step']}"
         lines.append(f"starts from {', '.join([at, *told])}: {parent['path']}")
         known, data = KnownData.of_plain(parent.get("data")), KnownData.of_plain(card["data"])
         if known is not None and data is not None and not known.is_same(data):
