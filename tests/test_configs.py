@@ -162,7 +162,7 @@ def test_small_networks_are_built(preset):
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize(
-    "chosen", ["model=unprojection", "experiment=unprojection_stage2", "model/backbone=unprojection"]
+    "chosen", ["model=unprojection", "variant=unprojection", "model/backbone=unprojection"]
 )
 def test_the_baseline_has_the_presets_sizes(preset, chosen):
     baseline, network = (plain(train_config(f"preset={preset}", *more))["model"] for more in ([chosen], []))

@@ -9,12 +9,10 @@ from typing import Any
 
 from torch import Tensor
 
+from raytran.checkpoints.runs import STAGE_NAMES
 from raytran.errors import CheckpointError
 
 FORMAT = "raytran.checkpoint/1"
-
-STAGE_NAMES = {"occupancy": "stage1", "joint": "stage2", "shape": "stage3", "view": "novel_view"}
-"""What the stages were called in earlier checkpoints, and are called now."""
 
 _REQUIRED = {"stage": str, "preset": str, "model": dict, "views": dict, "state_dict": dict}
 

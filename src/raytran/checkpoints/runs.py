@@ -16,7 +16,6 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from raytran.checkpoints.content import STAGE_NAMES
 from raytran.checkpoints.launched import name_by_time
 from raytran.data.atomic import write_json
 from raytran.errors import CheckpointError, ConfigError
@@ -27,6 +26,9 @@ LAST = Path("checkpoints") / "last.ckpt"
 PREVIOUS = LAST.with_name("previous.ckpt")
 FINISHED = "finished.json"
 _LOCK = ".lock"
+
+STAGE_NAMES = {"occupancy": "stage1", "joint": "stage2", "shape": "stage3", "view": "novel_view"}
+"""What the stages were called in earlier checkpoints, runs and settings, and are called now."""
 
 
 @dataclass(frozen=True)

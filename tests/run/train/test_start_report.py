@@ -91,17 +91,18 @@ def test_settings_that_change_in_a_resumed_run_are_named():
     ]
 
 
-@pytest.mark.parametrize("experiment", ["stage2", "gt_masks_stage2"])
-def test_settings_that_came_later_are_no_change(experiment):
+@pytest.mark.parametrize("masks", [False, True])
+def test_settings_that_came_later_are_no_change(masks):
     """A run from before there were keys for what it did goes on without a word, unless they say otherwise."""
-    typed = ["preset=tiny", f"experiment={experiment}", "output_dir=unused"]
+    typed = ["preset=tiny", "experiment=stage2", "output_dir=unused"] + ["variant=gt_masks"] * masks
     before = plain(compose("train", typed))
     for key in ("shape_layers", "center_beta", "yaw_beta"):
         del before["loss"][key]
     for key in ("class_cost", "center_beta", "yaw_beta"):
         del before["loss"]["matcher"][key]
     del before["data"]["name"], before["data"]["dataset"]["object_choice"]
-    before["data"]["dataset"]["input_mask"] = experiment != "stage2"
+    before["data"]["dataset"]["input_mask"] = masks
+    del before["variant_prefix"]
     assert changed_settings(before, plain(compose("train", typed))) == []
     more = ["loss.shape_layers=all", "data.dataset.object_choice=seen", "loss.yaw_beta=0.2"]
     assert sorted(changed_settings(before, plain(compose("train", [*typed, *more])))) == [

@@ -52,10 +52,14 @@ def run_curriculum(
         stages: experiments, in order.
 
     Raises:
-        ConfigError: ``overrides`` names an experiment, or the folder holds a curriculum with other settings.
+        ConfigError: ``overrides`` names an experiment, a setting or a stage does not exist, or the folder holds
+            a curriculum with other settings.
     """
     if any(item.startswith("experiment=") for item in overrides):
         raise ConfigError(f"a curriculum runs the experiments {list(stages)}: choose them with stages=[…]")
+    presets = [
+        compose("train", [*overrides, f"experiment={name}", "output_dir=none"]).preset for name in stages
+    ]
     _record(output_dir, overrides, stages)
     results: list[FitResult] = []
     for number, experiment in enumerate(stages, start=1):
@@ -68,7 +72,7 @@ def run_curriculum(
     write_finished(
         output_dir,
         stage="curriculum",
-        preset=_preset(overrides),
+        preset=presets[-1],
         experiment="curriculum",
         steps=results[-1].steps,
     )
@@ -142,7 +146,3 @@ def _read_record(path: Path) -> dict[str, Any]:
         return dict(json.loads(path.read_text()))
     except (ValueError, TypeError) as error:
         raise ConfigError(f"{path} is damaged: delete it and give the same command again") from error
-
-
-def _preset(overrides: Sequence[str]) -> str:
-    return str(compose("train", [*overrides, "output_dir=none"]).preset)
