@@ -52,8 +52,8 @@ def run_curriculum(
         stages: experiments, in order.
 
     Raises:
-        ConfigError: ``overrides`` names an experiment, or a setting or stage that does not exist, or the folder
-            holds a curriculum with other settings.
+        ConfigError: ``overrides`` names an experiment, there is no such setting or stage, or the folder holds
+            a curriculum with other settings.
     """
     if any(item.startswith("experiment=") for item in overrides):
         raise ConfigError(f"a curriculum runs the experiments {list(stages)}: choose them with stages=[…]")
