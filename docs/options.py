@@ -147,24 +147,19 @@ def _choices_table(name: str) -> list[str]:
             continue
         ((key, chosen),) = entry.items()
         group = "/".join([*Path(name).parts[:-1], key.split()[-1].lstrip("/")])
-        if key.startswith("optional") or group.startswith("hydra/job_logging"):
+        if key.startswith("optional"):
             continue
         for path in sorted((CONF / group).glob("*.yaml")):
-            if path.stem != "base" and (group != "experiment" or _is_of(name, path)):
+            if path.stem != "base":
                 mark = "default" if path.stem == chosen else ""
                 rows.append(f"| `{group}={path.stem}` | {mark} | {_cell(header(path))} |")
     return rows
 
 
-def _is_of(name: str, experiment: Path) -> bool:
-    """Say whether an experiment is one to train; the others are for ``evaluate``."""
-    return ("experiment:" in experiment.read_text(encoding="utf-8")) == (name != "evaluate")
-
-
 def _presets_table(_: str) -> list[str]:
     found = {path.stem: options(f"preset/{path.stem}") for path in (CONF / "preset").glob("*.yaml")}
     columns = {name: {option.name: option for option in listed} for name, listed in found.items()}
-    names = sorted(columns, key=lambda name: -int(columns[name]["schedule.occupancy.steps"].value or 0))
+    names = sorted(columns, key=lambda name: -int(columns[name]["schedule.stage1.steps"].value or 0))
     rows = ["| setting | " + " | ".join(f"`preset={name}`" for name in names) + " | |"]
     rows.append("|---" * (len(names) + 2) + "|")
     for option in columns[names[0]].values():

@@ -225,8 +225,8 @@ def trained(tmp_path_factory):
     ]
     config = compose("train", [*settings, "data.root=/home/me/rooms", f"output_dir={folder}"])
     model = build_model(config, pretrained=False)
-    parent = {"path": "/home/me/stage2/last.ckpt", "stage": "joint", "step": 3, "scores": {"val/loss": 1.0}}
-    card = checkpoint_card(stage="shape", preset="tiny", config=plain(config), parent=parent)
+    parent = {"path": "/home/me/stage2/last.ckpt", "stage": "stage2", "step": 3, "scores": {"val/loss": 1.0}}
+    card = checkpoint_card(stage="stage3", preset="tiny", config=plain(config), parent=parent)
     state = {f"model.{name}": value for name, value in model.state_dict().items()}
     scores = {"val/objects/f1_0.25": 0.5, "val/objects/f1_0.25/chair": 0.7}
     more = {"scores": scores, "global_step": 40, "optimizer_states": [{}]}

@@ -139,7 +139,7 @@ def test_the_papers_preset_is_the_default_of_the_code():
 
 def test_the_papers_numbers():
     config = train_config("preset=raytran", "trainer=ddp", "precision=16-mixed", "experiment=stage2")
-    assert [config.schedule[stage].steps for stage in ("occupancy", "joint", "shape")] == [
+    assert [config.schedule[stage].steps for stage in ("stage1", "stage2", "stage3")] == [
         224000,
         239000,
         5000,
@@ -172,7 +172,7 @@ def test_small_networks_are_built(preset):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("chosen", ["experiment=unprojection_stage2", "model/backbone=unprojection"])
+@pytest.mark.parametrize("chosen", ["variant=unprojection", "model/backbone=unprojection"])
 def test_the_baseline_has_the_presets_sizes(preset, chosen):
     baseline, network = (plain(train_config(f"preset={preset}", *more))["model"] for more in ([chosen], []))
     kinds = [model["backbone"].pop("_target_") for model in (baseline, network)]

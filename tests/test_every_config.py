@@ -30,7 +30,6 @@ ROOTS = {
 
 
 PARTS_OF_THE_MODEL = ("model/backbone", "model/encoder", "model/size")
-OF_EVALUATION = ("frames_", "objects_")
 
 
 def files(*folders):
@@ -67,7 +66,7 @@ def test_no_folder_is_forgotten():
     folders = {str(path.parent) for path in FILES} - {"local"}
     assert folders == {
         *(".", "data", "debug", "experiment", "logger", "loss", "model", "preset", "stage", "sweep"),
-        *("trainer", "hydra/launcher", "hydra/sweeper", *PARTS_OF_THE_MODEL),
+        *("trainer", "variant", "hydra", "hydra/launcher", "hydra/sweeper", *PARTS_OF_THE_MODEL),
     }
 
 
@@ -95,11 +94,6 @@ def test_data(path):
 
 @pytest.mark.parametrize("path", files("experiment"), ids=name)
 def test_experiments(path):
-    if path.name.startswith(OF_EVALUATION):
-        config = compose("evaluate", ["preset=tiny", "checkpoint=x", f"experiment={path.name}"])
-        key, number = path.name.split("_")
-        assert config[{"frames": "num_views", "objects": "max_objects"}[key]] == int(number)
-        return
     config = chosen(path)
     assert config.experiment == path.name
     assert config.optimized_metric.startswith("val/")
@@ -109,6 +103,19 @@ def test_experiments(path):
     build_everything(config)
 
 
+@pytest.mark.parametrize("path", files("variant"), ids=name)
+@pytest.mark.parametrize("experiment", files("experiment"), ids=name)
+def test_a_variant_of_every_experiment_comes_after_the_same_variant_of_its_parent(path, experiment):
+    plainly = compose("train", ["preset=tiny", f"experiment={experiment.name}", "output_dir=x"])
+    config = chosen(path, f"experiment={experiment.name}")
+    assert config.experiment == f"{path.name}_{plainly.experiment}"
+    assert config.stage.parent == plainly.stage.parent
+    if config.stage.parent is not None:
+        assert config.stage.parent_experiment == f"{path.name}_{plainly.stage.parent_experiment}"
+    if experiment.name == "stage1":
+        build_everything(config)
+
+
 def test_the_papers_ablations_are_what_they_say():
     config = compose("train", ["preset=raytran", "experiment=no_masks_stage2", "output_dir=x"])
     model = build_model(config, pretrained=False)
@@ -116,7 +123,7 @@ def test_the_papers_ablations_are_what_they_say():
     module.stage.freeze(model)
     assert not any(parameter.requires_grad for parameter in model.heads["foreground"].parameters())
     assert "foreground" not in {*module.stage.tasks, *module.stage.terms, *config.data.targets}
-    config = compose("train", ["preset=raytran", "experiment=gt_masks_stage3", "output_dir=x"])
+    config = compose("train", ["preset=raytran", "variant=gt_masks", "experiment=stage3", "output_dir=x"])
     assert build_model(config, pretrained=False).backbone.encoder.input_channels == 4
     assert config.data.dataset.input_mask == "amodal"
 

@@ -126,7 +126,7 @@ def compare_ranks(
         "schedule.log_every=1",
         f"schedule.batch={count}",
         # At tiny's own rate of 1e-3 rounding alone parts two runs by 0.1 within 20 steps (seen on a CPU).
-        "schedule.occupancy.learning_rate=1.0e-4",
+        "schedule.stage1.learning_rate=1.0e-4",
     ]
     # TF32 would round the same products differently for other numbers of scenes.
     exact = {"NVIDIA_TF32_OVERRIDE": "0"}

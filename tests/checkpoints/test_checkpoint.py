@@ -24,8 +24,8 @@ def config():
 def saved(config, tmp_path):
     """A checkpoint as training writes it, and the model in it."""
     model = build_model(config)
-    parent = {"path": "stage1.ckpt", "stage": "occupancy", "step": 3, "scores": {}}
-    card = checkpoint_card(stage="joint", preset="tiny", config=plain(config), parent=parent)
+    parent = {"path": "stage1.ckpt", "stage": "stage1", "step": 3, "scores": {}}
+    card = checkpoint_card(stage="stage2", preset="tiny", config=plain(config), parent=parent)
     state = {f"model.{name}": value for name, value in model.state_dict().items()}
     path = tmp_path / "last.ckpt"
     write_checkpoint(path, {**card, "state_dict": state})
@@ -45,7 +45,7 @@ def test_the_card_is_complete(saved):
     content = torch.load(saved[0], weights_only=True)
     assert content["format"] == "raytran.checkpoint/2"
     assert (content["stage"], content["preset"], content["parent"]["path"]) == (
-        "joint",
+        "stage2",
         "tiny",
         "stage1.ckpt",
     )
@@ -140,7 +140,7 @@ def test_a_head_of_another_form_starts_at_random_if_that_of_the_parent_is_random
     )
     model = build_model(changed)
     own = {name: value.clone() for name, value in model.heads["objects"].state_dict().items()}
-    first = {**torch.load(path, weights_only=True), "stage": "occupancy", "parent": None}
+    first = {**torch.load(path, weights_only=True), "stage": "stage1", "parent": None}
     first["config"]["stage"] = plain(config.stage)
     assert plain(config.stage)["trainable"] == ["backbone", "heads.occupancy"]
     assert parts_afresh(build_model(config), first, []) == []

@@ -12,9 +12,10 @@ import torch
 
 from raytran.checkpoints.content import FORMAT
 from raytran.checkpoints.file import read_checkpoint, read_newest, write_checkpoint
+from raytran.checkpoints.weights_file import write_weights
 from raytran.errors import CheckpointError
 
-CARD = {"format": FORMAT, "stage": "joint", "preset": "tiny", "model": {}, "views": {}}
+CARD = {"format": FORMAT, "stage": "stage2", "preset": "tiny", "model": {}, "views": {}}
 
 
 def content(value=0.0, **changes):
@@ -43,6 +44,34 @@ def test_what_is_written_is_read_without_trust(path):
     assert torch.equal(read_checkpoint(path)["state_dict"]["weight"], torch.arange(1000.0))
     assert torch.load(path, weights_only=True)["format"] == "raytran.checkpoint/2"
     assert [file.name for file in path.parent.iterdir()] == ["last.ckpt"]
+
+
+@pytest.mark.parametrize("ending", ["ckpt", "safetensors"])
+def test_stages_of_earlier_checkpoints_have_their_present_names(tmp_path, ending):
+    path = tmp_path / f"old.{ending}"
+    stage = {"name": "view", "parent": "occupancy", "other_parents": ["joint", "shape"], "terms": ["view"]}
+    card = {
+        **CARD,
+        "stage": "view",
+        "parent": {"stage": "occupancy", "step": 3},
+        "config": {"stage": stage, "schedule": {"batch": 2, "joint": {"steps": 5}}, "loss": {"shape": 1.0}},
+    }
+    if ending == "ckpt":
+        write_checkpoint(path, {**card, "state_dict": {}})
+    else:
+        write_weights(path, card, {})
+    found = read_checkpoint(path)
+    assert (found["stage"], found["parent"]) == ("novel_view", {"stage": "stage1", "step": 3})
+    assert found["config"] == {
+        "stage": {
+            "name": "novel_view",
+            "parent": "stage1",
+            "other_parents": ["stage2", "stage3"],
+            "terms": ["view"],
+        },
+        "schedule": {"batch": 2, "stage2": {"steps": 5}},
+        "loss": {"shape": 1.0},
+    }
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.99])

@@ -22,7 +22,7 @@ from raytran.checkpoints.runs import (
 from raytran.errors import CheckpointError, ConfigError
 
 
-def make_run(folder, *, stage="occupancy", preset="tiny", finished=None, age=0.0):
+def make_run(folder, *, stage="stage1", preset="tiny", finished=None, age=0.0):
     (folder / LAST).parent.mkdir(parents=True)
     (folder / LAST).touch()
     os.utime(folder / LAST, (1e9 - age, 1e9 - age))
@@ -34,10 +34,10 @@ def make_run(folder, *, stage="occupancy", preset="tiny", finished=None, age=0.0
 
 
 def test_a_mark_is_read_back(tmp_path):
-    written = write_finished(tmp_path, stage="joint", preset="small", experiment="stage2", steps=7)
+    written = write_finished(tmp_path, stage="stage2", preset="small", experiment="stage2", steps=7)
     assert read_finished(tmp_path) == written
     assert (written.stage, written.preset, written.steps, written.checkpoint) == (
-        "joint",
+        "stage2",
         "small",
         7,
         LAST.as_posix(),
@@ -46,7 +46,7 @@ def test_a_mark_is_read_back(tmp_path):
 
 def test_a_mark_says_what_the_run_was_trained_on(tmp_path):
     known = {"name": "rooms", "root": "data/rooms", "annotation": "ab12", "made": {"seed": 0}}
-    names = {"stage": "joint", "preset": "small", "experiment": "stage2", "steps": 7}
+    names = {"stage": "stage2", "preset": "small", "experiment": "stage2", "steps": 7}
     assert write_finished(tmp_path, **names, data=known).data == known
     assert read_finished(tmp_path).data == known
     # One from before that was written down can be read too.
@@ -54,6 +54,12 @@ def test_a_mark_says_what_the_run_was_trained_on(tmp_path):
     del mark["data"]
     (tmp_path / FINISHED).write_text(json.dumps(mark))
     assert read_finished(tmp_path).data is None
+
+
+def test_a_mark_of_an_earlier_version_is_of_the_stage_as_it_is_called_now(tmp_path):
+    for old, new in (("occupancy", "stage1"), ("view", "novel_view"), ("mine", "mine")):
+        write_finished(tmp_path, stage=old, preset="small", experiment="stage1", steps=7)
+        assert read_finished(tmp_path).stage == new
 
 
 def test_no_mark_is_none(tmp_path):
@@ -71,9 +77,9 @@ def test_the_finished_runs_of_a_stage_are_found_newest_first(tmp_path):
     newest = make_run(tmp_path / "tiny" / "curriculum" / "b" / "stage1", finished="2026-01-04")
     oldest = make_run(tmp_path / "tiny" / "stage1" / "c", finished="2026-01-01")
     make_run(tmp_path / "tiny" / "stage1" / "unfinished")
-    make_run(tmp_path / "tiny" / "stage2" / "d", stage="joint", finished="2026-01-05")
+    make_run(tmp_path / "tiny" / "stage2" / "d", stage="stage2", finished="2026-01-05")
     make_run(tmp_path / "small" / "stage1" / "e", preset="small", finished="2026-01-06")
-    found = finished_runs(tmp_path, preset="tiny", stage="occupancy")
+    found = finished_runs(tmp_path, preset="tiny", stage="stage1")
     assert [path for path, _ in found] == [newest / LAST, older / LAST, oldest / LAST]
     assert [mark.time for _, mark in found] == ["2026-01-04", "2026-01-03", "2026-01-01"]
 
@@ -81,7 +87,7 @@ def test_the_finished_runs_of_a_stage_are_found_newest_first(tmp_path):
 def test_a_finished_run_without_its_checkpoint_does_not_count(tmp_path):
     run = make_run(tmp_path / "tiny" / "stage1" / "a", finished="2026-01-03")
     (run / LAST).unlink()
-    assert finished_runs(tmp_path, preset="tiny", stage="occupancy") == []
+    assert finished_runs(tmp_path, preset="tiny", stage="stage1") == []
 
 
 def test_the_newest_unfinished_run_is_found(tmp_path):
@@ -131,6 +137,6 @@ def test_resume_from_a_loose_file_is_one_sentence(tmp_path):
 
 def test_a_parent_is_a_run_of_the_experiment_that_was_asked_for(tmp_path):
     run = make_run(tmp_path / "tiny" / "stage1" / "a", finished="2026-01-01")
-    asked = {"preset": "tiny", "stage": "occupancy"}
+    asked = {"preset": "tiny", "stage": "stage1"}
     assert [path for path, _ in finished_runs(tmp_path, experiment="stage1", **asked)] == [run / LAST]
     assert finished_runs(tmp_path, experiment="gt_masks_stage1", **asked) == []

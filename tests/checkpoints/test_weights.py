@@ -70,6 +70,6 @@ def test_what_the_package_carries_is_whole_and_described():
     assert len(files) <= 1
     for path in files:
         assert not load_model(path).training
-        assert prediction_settings(path).stage == "shape"
+        assert prediction_settings(path).stage == "stage3"
         assert path.name in page
         assert hashlib.sha256(path.read_bytes()).hexdigest() in page

@@ -15,7 +15,7 @@ from raytran.checkpoints.file import read_checkpoint, write_checkpoint
 from raytran.checkpoints.weights_file import write_weights
 from raytran.errors import CheckpointError
 
-CARD = {"format": FORMAT, "stage": "joint", "preset": "tiny", "model": {"a": [1, 2.5, None]}, "views": {}}
+CARD = {"format": FORMAT, "stage": "stage2", "preset": "tiny", "model": {"a": [1, 2.5, None]}, "views": {}}
 WEIGHTS = {
     "a.weight": torch.arange(1000.0).view(10, 100),
     "a.steps": torch.tensor(7),
@@ -71,7 +71,7 @@ def test_tensors_that_share_memory_are_written(tmp_path):
 
 def test_another_name(path, tmp_path):
     as_ckpt = path.rename(tmp_path / "weights.ckpt")
-    assert read_checkpoint(as_ckpt)["stage"] == "joint"
+    assert read_checkpoint(as_ckpt)["stage"] == "stage2"
     write_checkpoint(tmp_path / "a.ckpt", {**CARD, "state_dict": WEIGHTS})
     as_weights = (tmp_path / "a.ckpt").rename(tmp_path / "a.safetensors")
     with pytest.raises(CheckpointError, match="no safetensors file"):

@@ -70,7 +70,7 @@ def test_two_ranks_share_one_folder_a_stage(curriculum):
 @pytest.mark.slow
 def test_ranks_share_the_batch_norms_of_voxels_too(steps, tmp_path, command):
     """The ranks' networks are compared at every validation; one that differs stops the command."""
-    arguments = [*steps, "trainer=ddp_cpu", "experiment=unprojection_stage1", "output_dir=run"]
+    arguments = [*steps, "trainer=ddp_cpu", "variant=unprojection", "output_dir=run"]
     done = command("train", *arguments, folder=tmp_path)
     assert done.returncode == 0, done.stderr
     state = torch.load(tmp_path / "run" / LAST, weights_only=True)["state_dict"]

@@ -35,11 +35,11 @@ def weights(settings, tmp_path_factory):
 
 
 def test_a_stage_starts_from_weights(settings, weights, tmp_path):
-    frozen = ["experiment=stage2", "check_parent=stage", "schedule.joint.learning_rate=0"]
+    frozen = ["experiment=stage2", "check_parent=stage", "schedule.stage2.learning_rate=0"]
     fit(settings, tmp_path / "run", *frozen, f"init_from={weights}")
     content, parent = read_checkpoint(tmp_path / "run" / LAST), read_checkpoint(weights)
     assert content["parent"]["path"] == str(weights)
-    assert (content["parent"]["stage"], content["parent"]["step"]) == ("occupancy", 1)
+    assert (content["parent"]["stage"], content["parent"]["step"]) == ("stage1", 1)
     state = content["state_dict"]
     assert all(
         torch.equal(value, state[name])

@@ -112,7 +112,7 @@ def test_rooms_of_another_seed_are_other_data(settings, parent, outputs, tmp_pat
 
 
 def test_metrics_say_which_scenes_and_how_many_frames(parent, rooms, tmp_path, command):
-    asked = [f"checkpoint={parent.checkpoint}", f"data.root={rooms}", "experiment=frames_20"]
+    asked = [f"checkpoint={parent.checkpoint}", f"data.root={rooms}", "num_views=20"]
     done = command("evaluate", *asked, "output=results", folder=tmp_path)
     assert done.returncode == 0, done.stderr
     metrics = json.loads((tmp_path / "results" / "metrics.json").read_text())

@@ -86,7 +86,7 @@ def test_two_stages_train_and_say_what_is_needed(fits, checkpoint):
     assert line not in said[1], "trust=[mylab] was given: it is known"
     card = torch.load(checkpoint, weights_only=True)
     assert card["model"]["backbone"]["_target_"] == "mylab.MyBackbone"
-    assert card["parent"]["stage"] == "occupancy"
+    assert card["parent"]["stage"] == "stage1"
 
 
 def test_evaluate(run, checkpoint, rooms, lab):

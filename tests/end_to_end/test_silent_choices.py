@@ -124,7 +124,7 @@ def test_a_visible_mask(settings, rooms, tmp_path, command):
     root = tmp_path / "rooms"
     shutil.copytree(rooms, root)
     asked = [*(item for item in settings if not item.startswith("data.root")), f"data.root={root}"]
-    asked += ["experiment=gt_masks_stage1", "data.dataset.input_mask=visible"]
+    asked += ["variant=gt_masks", "data.dataset.input_mask=visible"]
     with pytest.raises(DataError, match=r"_vh_clean_2\.ply, which tells what hides objects"):
         fit(asked, tmp_path / "without", *ONE_STEP)
     meshes = []

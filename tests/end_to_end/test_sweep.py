@@ -64,6 +64,6 @@ def test_a_second_call_runs_only_what_failed(swept, command):
 
 def test_a_row_of_the_papers_tables_is_evaluated(swept, rooms, command):
     words = [f"checkpoint={swept[2] / '0' / LAST}", f"data.root={rooms}", "device=cpu", "num_views=4"]
-    done = command("evaluate", *words, "experiment=objects_10", "output=few", folder=swept[2])
+    done = command("evaluate", *words, "max_objects=10", "output=few", folder=swept[2])
     assert done.returncode == 0, done.stderr
     assert json.loads((swept[2] / "few" / "metrics.json").read_text())["max_objects"] == 10

@@ -46,9 +46,9 @@ def test_a_curriculum_trains_three_stages(trained):
     assert [fit.folder.name for fit in fits] == ["stage1", "stage2", "stage3"]
     stages = [read_finished(fit.folder) for fit in fits]
     assert [(mark.stage, mark.preset, mark.steps) for mark in stages] == [
-        ("occupancy", "tiny", 4),
-        ("joint", "tiny", 4),
-        ("shape", "tiny", 4),
+        ("stage1", "tiny", 4),
+        ("stage2", "tiny", 4),
+        ("stage3", "tiny", 4),
     ]
     cards = [torch.load(fit.checkpoint, weights_only=True) for fit in fits]
     assert cards[0]["parent"] is None
@@ -195,7 +195,7 @@ def test_a_run_is_not_continued_as_another_stage(settings, trained, tmp_path):
     target = tmp_path / "run" / LAST
     target.parent.mkdir(parents=True)
     target.write_bytes(trained[1][0].checkpoint.read_bytes())
-    with pytest.raises(CheckpointError, match="is of stage occupancy, not joint"):
+    with pytest.raises(CheckpointError, match="is of stage1, not stage2"):
         fit(settings, tmp_path / "run", "experiment=stage2", "resume=auto")
 
 

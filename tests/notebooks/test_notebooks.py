@@ -45,7 +45,7 @@ def untrained(tmp_path_factory):
 
     path = tmp_path_factory.mktemp("untrained") / "last.ckpt"
     config = compose("train", ["preset=tiny", "model.grid_resolution=[8,8,4]", f"output_dir={path.parent}"])
-    card = checkpoint_card(stage="shape", preset="tiny", config=plain(config), parent=None)
+    card = checkpoint_card(stage="stage3", preset="tiny", config=plain(config), parent=None)
     state = build_model(config, pretrained=False).state_dict()
     write_checkpoint(path, {**card, "state_dict": {f"model.{name}": value for name, value in state.items()}})
     return path

@@ -36,7 +36,7 @@ RUNS = {
     "stage2": ("experiment=stage2",),
     "stage3": ("experiment=stage3",),
     "voxels normalised": ("experiment=stage1", "model.backbone.start_levels=2"),
-    "no attention": ("experiment=unprojection_stage1",),
+    "no attention": ("experiment=stage1", "variant=unprojection"),
 }
 """The runs that ranks are compared in, and their settings."""
 STEPS = 5

@@ -170,5 +170,5 @@ def test_statistics_move_or_stay_whatever_mode_somebody_sets(experiment, batch, 
 def test_an_unknown_part_is_an_error(make_module):
     module = make_module("stage1")
     stage = replace(module.stage, trainable=["backbone", "heads.colour"])
-    with pytest.raises(ConfigError, match=r"stage occupancy trains 'heads\.colour'"):
+    with pytest.raises(ConfigError, match=r"stage1 trains 'heads\.colour'"):
         stage.freeze(module.model)

@@ -27,6 +27,9 @@ _FORMER_PATHS = {
     "raytran.heads.view.ViewHead": "ViewHead",
 }
 
+STAGE_NAMES = {"occupancy": "stage1", "joint": "stage2", "shape": "stage3", "view": "novel_view"}
+"""Former name of a stage → its name."""
+
 _FORMER_WEIGHTS = (
     (r"^model\.backbone\.resnet\.", "model.backbone.image_features.encoder."),
     (r"^model\.backbone\.projection\.", "model.backbone.image_features.projection."),
@@ -39,13 +42,37 @@ _FORMER_WEIGHTS = (
 
 def upgraded(content: Mapping[str, Any]) -> dict[str, Any]:
     """Return the content of a checkpoint of format 1 as this version writes it, but for its ``format``."""
-    new = dict(content)
+    new = _with_stage_names(content)
     new["model"] = upgraded_network(content["model"])
     new["state_dict"] = {_weight_name(name): value for name, value in content["state_dict"].items()}
-    config = content.get("config")
+    config = new.get("config")
     if isinstance(config, Mapping) and isinstance(config.get("model"), Mapping):
         new["config"] = {**config, "model": with_import_paths(upgraded_network(config["model"]))}
     return new
+
+
+def _with_stage_names(content: Mapping[str, Any]) -> dict[str, Any]:
+    """Return ``content`` with its stages under the names they have now."""
+    renamed = dict(content)
+    renamed["stage"] = _stage_name(content["stage"])
+    for name, keys in (("parent", ["stage"]), ("config", ["stage", "schedule"])):
+        if isinstance(part := content.get(name), Mapping):
+            renamed[name] = {key: _stage_name(value) if key in keys else value for key, value in part.items()}
+    return renamed
+
+
+def _stage_name(said: Any) -> Any:
+    """Return what names stages with their present names: a name, a list of names, or settings by name."""
+    if isinstance(said, str):
+        return STAGE_NAMES.get(said, said)
+    if isinstance(said, Mapping):
+        return {
+            STAGE_NAMES.get(key, key): _stage_name(value)
+            if key in ("name", "parent", "other_parents")
+            else value
+            for key, value in said.items()
+        }
+    return [_stage_name(name) for name in said] if isinstance(said, list | tuple) else said
 
 
 def _weight_name(name: str) -> str:

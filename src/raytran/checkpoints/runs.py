@@ -10,11 +10,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from raytran.checkpoints.earlier import STAGE_NAMES
 from raytran.checkpoints.launched import name_by_time
 from raytran.data.files import exclusive_lock, write_json
 from raytran.errors import CheckpointError, ConfigError
@@ -89,7 +90,8 @@ def read_finished(folder: Path) -> Finished | None:
     if not path.is_file():
         return None
     try:
-        return Finished(**json.loads(path.read_text()))
+        mark = Finished(**json.loads(path.read_text()))
+        return replace(mark, stage=STAGE_NAMES.get(mark.stage, mark.stage))
     except (ValueError, TypeError) as error:
         raise CheckpointError(
             f"{path} is damaged: delete it and run that stage again with resume=auto"

@@ -5,8 +5,10 @@ from __future__ import annotations
 
 import functools
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from hydra.errors import ConfigCompositionException, InstantiationException, Ove
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from raytran.checkpoints.earlier import STAGE_NAMES
 from raytran.checkpoints.launched import first_ranks
 from raytran.checkpoints.runs import run_folder
 from raytran.errors import ConfigError, RaytranError
@@ -25,6 +28,14 @@ from raytran.run.sweep.folder import register_sweep_resolver
 
 _FULL_ERROR = "HYDRA_FULL_ERROR"
 """Hydra's own switch: with it set to 1, errors are shown at length."""
+
+_RENAMED = (
+    (r"experiment=(gt_masks|unprojection)_(\w+)", r"variant=\1 experiment=\2"),
+    (r"experiment=frames_(\d+)", r"num_views=\1"),
+    (r"experiment=objects_(\d+)", r"max_objects=\1"),
+    *((rf"(stage=|schedule\.){old}\b", rf"\g<1>{new}") for old, new in STAGE_NAMES.items()),
+)
+"""Settings of earlier versions as they were typed, and as they are typed now."""
 
 _TYPED_FULL_ERROR = os.environ.get(_FULL_ERROR)
 
@@ -65,9 +76,7 @@ def _compose_or_exit(command: Callable[[], Any], typed: str | None) -> Any:
         return command()
     except ConfigCompositionException as error:
         _set_full_error(typed)
-        _exit_with(
-            ConfigError(f"{_first_line(error)}: there is no such setting or choice (--help lists them)")
-        )
+        _exit_with(_no_such_setting(error, sys.argv[1:]))
     except OverrideParseException as error:
         _set_full_error(typed)
         _exit_with(ConfigError(f"{_first_line(error)}: settings are written key=value"))
@@ -84,6 +93,15 @@ def _compose_or_exit(command: Callable[[], Any], typed: str | None) -> Any:
         _set_full_error(typed)
         # A resolver of ours that objects is wrapped by OmegaConf; its message is the clearer one.
         _exit_with(ConfigError(_first_line(error).split("resolving interpolation: ")[-1]))
+
+
+def _no_such_setting(error: ConfigCompositionException, typed: Sequence[str]) -> ConfigError:
+    """Return what to say of settings that Hydra does not know; of those it knew once, what they are now."""
+    for word in typed:
+        for pattern, now in _RENAMED:
+            if re.match(pattern, word):
+                return ConfigError(f"{word} is called {re.sub(pattern, now, word)} now: give that instead")
+    return ConfigError(f"{_first_line(error)}: there is no such setting or choice (--help lists them)")
 
 
 def _first_line(error: Exception) -> str:
@@ -136,13 +154,19 @@ def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
         config_name: root file in ``conf/`` without ending.
         overrides: what a user would type, e.g. ``["preset=tiny", "experiment=stage2"]``. ``output_dir``
             must be among them if the result is to be run.
+
+    Raises:
+        ConfigError: there is no such setting or choice.
     """
     register_resolvers()
     register_sweep_resolver()
-    if GlobalHydra.instance().is_initialized():
-        return hydra.compose(config_name, overrides=list(overrides))
-    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
-        return hydra.compose(config_name, overrides=list(overrides))
+    already = GlobalHydra.instance().is_initialized()
+    folder = nullcontext() if already else hydra.initialize_config_dir(str(config_dir()), version_base="1.3")
+    with folder:
+        try:
+            return hydra.compose(config_name, overrides=list(overrides))
+        except ConfigCompositionException as error:
+            raise _no_such_setting(error, overrides) from error
 
 
 def quoted(path: Path) -> str:

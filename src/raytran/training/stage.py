@@ -18,7 +18,7 @@ class Stage:
     """One stage, one fit.
 
     Attributes:
-        name: ``occupancy``, ``joint``, ``shape``, …
+        name: ``stage1``, ``stage2``, ``stage3``, ``novel_view``, …
         parent: name of the stage whose weights this one starts from, None for the first.
         other_parents: names of more stages that may be the parent, if one is given by hand.
         parent_experiment: the experiment that trains the parent, to be named in messages.
@@ -60,7 +60,7 @@ class Stage:
         names = {name for name, _ in model.named_modules()}
         for part in self.trainable:
             if part not in names:
-                raise ConfigError(f"stage {self.name} trains '{part}', which the model does not have")
+                raise ConfigError(f"{self.name} trains '{part}', which the model does not have")
         idle = self._idle(model)
         for name, parameter in model.named_parameters():
             parameter.requires_grad_(_is_within(name, self.trainable) and not _is_within(name, idle))

@@ -26,9 +26,9 @@ FEW = [
     "views.image_size=[48,64]",
     "views.num_views=2",
     "views.predict_views=3",
-    "schedule.occupancy.steps=2",
-    "schedule.joint.steps=2",
-    "schedule.shape.steps=2",
+    "schedule.stage1.steps=2",
+    "schedule.stage2.steps=2",
+    "schedule.stage3.steps=2",
     "schedule.log_every=1",
     "progress_bar=none",
 ]
@@ -47,7 +47,7 @@ def test_a_network_of_ones_own_is_trusted_because_it_was_typed(tmp_path, mylab):
         f"data.root={tmp_path / 'rooms'}",
     ]
     cfg = compose("train", [*typed, "experiment=stage3", "output_dir=unused"])
-    card = checkpoint_card(stage="shape", preset="tiny", config=plain(cfg), parent=None)
+    card = checkpoint_card(stage="stage3", preset="tiny", config=plain(cfg), parent=None)
     state = {f"model.{name}": value for name, value in build_model(cfg).state_dict().items()}
     write_checkpoint(tmp_path / "last.ckpt", {**card, "state_dict": state})
     asked = _asked(typed, build_data(cfg), tmp_path / "last.ckpt")
@@ -77,4 +77,4 @@ def test_demo_from_nothing_to_a_page_and_again(tmp_path, caplog, capsys):
     assert "finished already" in caplog.text
 
     with pytest.raises(ConfigError, match="other settings"):
-        demo(config(output, "schedule.joint.steps=3"))
+        demo(config(output, "schedule.stage2.steps=3"))

@@ -40,7 +40,7 @@ def test_the_network_comes_back_bit_by_bit(trained, tmp_path):
     assert all(torch.equal(value, state[name]) for name, value in model.state_dict().items())
     assert prediction_settings(path) == prediction_settings(trained.path)
     of_both = [Parent.of(file, read_checkpoint(file)) for file in (path, trained.path)]
-    assert (of_both[0].stage, of_both[0].step) == ("shape", 40)
+    assert (of_both[0].stage, of_both[0].step) == ("stage3", 40)
     assert of_both[0].scores["val/objects/f1_0.25"] == 0.5
     assert of_both[0].scores == of_both[1].scores
 
@@ -50,8 +50,8 @@ def test_the_header_says_what_is_inside_and_nothing_of_the_machine(trained, tmp_
         text, names = file.metadata()["raytran"], set(file.keys())
     assert names == set(trained.model.state_dict())
     card = json.loads(text)
-    assert (card["stage"], card["preset"], card["global_step"]) == ("shape", "tiny", 40)
-    assert card["parent"] == {"stage": "joint", "step": 3}
+    assert (card["stage"], card["preset"], card["global_step"]) == ("stage3", "tiny", 40)
+    assert card["parent"] == {"stage": "stage2", "step": 3}
     assert card["versions"]["torch"] == torch.__version__
     assert card["model"]["grid_resolution"] == [8, 8, 4]
     assert "/home/me" not in text
@@ -151,7 +151,7 @@ def test_the_file_and_not_its_claim_decides_how_much_memory_is_taken(trained, tm
 def test_without_output_it_says_what_is_inside(trained, capsys):
     assert export_model(compose("export_model", [f"checkpoint={trained.path}"])) is None
     words = capsys.readouterr().out
-    for said in ("stage joint, 3 steps", "M, float32", "val/objects/f1_0.25", "0.5", torch.__version__):
+    for said in ("stage2, 3 steps", "M, float32", "val/objects/f1_0.25", "0.5", torch.__version__):
         assert said in words, said
     assert "val/objects/f1_0.25/chair" not in words
 
@@ -163,7 +163,7 @@ def test_a_program_says_how_to_use_it(trained, tmp_path, caplog):
     extra = {"raytran.json": ""}
     program = torch.export.load(path, extra_files=extra).module()
     about = json.loads(extra["raytran.json"])
-    assert (about["format"], about["operators"], about["stage"]) == ("raytran.program/1", "aten", "shape")
+    assert (about["format"], about["operators"], about["stage"]) == ("raytran.program/1", "aten", "stage3")
     size = prediction_settings(trained.path).image_size
     assert tuple(about["image_size"]) == size
     inputs = example_inputs(trained.model, walk(2).scaled_to(size))

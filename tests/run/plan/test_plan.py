@@ -149,7 +149,7 @@ def test_the_forecast_is_within_a_factor_of_two_of_the_measured_peak() -> None:
 
 
 def test_views_to_be_rendered_need_memory_in_training() -> None:
-    cfg = compose("plan", [*FAST, "stage=view"])
+    cfg = compose("plan", [*FAST, "stage=novel_view"])
     del cfg.model.grid
     model, load = build_model(cfg, pretrained=False), Load(1, 3, (96, 128), 20.0, fused=False)
     few, many = (

@@ -87,7 +87,7 @@ def scene(tmp_path):
 @pytest.fixture
 def oracle(monkeypatch) -> Oracle:
     model = Oracle()
-    settings = PredictionSettings(preset="tiny", stage="shape", image_size=IMAGE_SIZE, num_views=96)
+    settings = PredictionSettings(preset="tiny", stage="stage3", image_size=IMAGE_SIZE, num_views=96)
     monkeypatch.setattr(module, "prediction_settings", lambda path: settings)
     monkeypatch.setattr(module, "load_model", lambda path, attention, trust: model)
     return model
@@ -147,8 +147,12 @@ def test_all_files_are_written(scene, oracle, tmp_path):
 @pytest.mark.parametrize(
     ("stage", "mesh", "said"),
     [
-        ("joint", None, "boxes but no meshes"),
-        ("view", "meshes/00.ply", "left the backbone alone"),  # it may have begun from one that knows shapes
+        ("stage2", None, "boxes but no meshes"),
+        (
+            "novel_view",
+            "meshes/00.ply",
+            "left the backbone alone",
+        ),  # it may have begun from one that knows shapes
     ],
 )
 def test_meshes_of_other_stages(scene, oracle, tmp_path, monkeypatch, caplog, stage, mesh, said):

@@ -85,7 +85,7 @@ def test_the_metric_of_a_run_and_of_a_curriculum(tmp_path):
         stage = tmp_path / "both" / name
         stage.mkdir(parents=True)
         (stage / "metrics.csv").write_text(f"step,epoch,val/total\n2,0,{number}\n")
-        write_finished(stage, stage="joint", preset="tiny", experiment=name, steps=4)
+        write_finished(stage, stage="stage2", preset="tiny", experiment=name, steps=4)
     assert last_value(tmp_path / "both", "val/total")[0] == 1.0
 
 

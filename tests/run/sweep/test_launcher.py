@@ -36,7 +36,7 @@ JOB = textwrap.dedent(
     while not all(path.exists() for path in awaited):
         time.sleep(0.02)
     (folder / "value").write_text(str(seed / 10))
-    mark = {"stage": "occupancy", "preset": "tiny", "experiment": "stage1", "checkpoint": "x", "steps": 4}
+    mark = {"stage": "stage1", "preset": "tiny", "experiment": "stage1", "checkpoint": "x", "steps": 4}
     (folder / "finished.json").write_text(json.dumps({**mark, "time": "2026"}))
     (folder / "span.json").write_text(json.dumps([began, time.time()]))
     """

@@ -13,7 +13,7 @@ from raytran.training.ranks import SyncedBatchNorm
 def trainer(tmp_path, *settings):
     settings = ("preset=tiny", f"output_dir={tmp_path}", "trainer=cpu", "progress_bar=none", *settings)
     cfg = compose("train", settings)
-    return build_trainer(cfg, RunConfig.read(cfg), {"stage": "occupancy", "config": plain(cfg)})
+    return build_trainer(cfg, RunConfig.read(cfg), {"stage": "stage1", "config": plain(cfg)})
 
 
 def test_validations_are_counted_in_steps_however_many_batches_a_step_takes(tmp_path):

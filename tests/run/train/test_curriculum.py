@@ -11,8 +11,12 @@ import time
 
 import pytest
 
+from raytran.checkpoints.runs import LAST
 from raytran.errors import ConfigError
+from raytran.run.entry import compose
+from raytran.run.train import curriculum
 from raytran.run.train.curriculum import RECORD, _run, run_curriculum
+from raytran.run.train.fit import FitResult
 
 # Says that it is there; ends with another code at a signal.
 STAGE = """
@@ -55,3 +59,32 @@ def test_a_damaged_record_is_one_sentence(tmp_path, text):
     (tmp_path / RECORD).write_text(text)
     with pytest.raises(ConfigError, match=r"curriculum\.json is damaged: delete it"):
         run_curriculum(["preset=tiny"], output_dir=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("stages", "message"),
+    [
+        (("stage1", "stage9"), "experiment/stage9"),
+        (("gt_masks_stage1",), "is called variant=gt_masks experiment=stage1 now"),
+    ],
+)
+def test_an_experiment_that_does_not_exist_leaves_no_record(tmp_path, stages, message):
+    with pytest.raises(ConfigError, match=message):
+        run_curriculum(["preset=tiny"], output_dir=tmp_path, stages=stages)
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_variant_holds_for_every_stage(tmp_path, monkeypatch):
+    trained = []
+
+    def fit(settings, folder):
+        trained.append(compose("train", settings))
+        return FitResult(folder, folder / LAST, 1, 0.0, {})
+
+    monkeypatch.setattr(curriculum, "_fit", fit)
+    run_curriculum(["preset=tiny", "variant=gt_masks"], output_dir=tmp_path)
+    assert [cfg.experiment for cfg in trained] == [f"gt_masks_stage{number}" for number in (1, 2, 3)]
+    assert {cfg.model.backbone.encoder.input_channels for cfg in trained} == {4}
+    assert [cfg.init_from for cfg in trained[1:]] == [
+        str(tmp_path / stage / LAST) for stage in ("stage1", "stage2")
+    ]

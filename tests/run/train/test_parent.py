@@ -33,14 +33,14 @@ def parent(name, **scores):
 @pytest.mark.parametrize(
     ("experiment", "found"),
     [
-        ("stage1", parent("joint")),  # the first stage asks for nothing
-        ("stage2", parent("occupancy", occupancy__iou=0.2)),
-        ("stage2", parent("joint")),  # more of the same
-        ("stage3", Parent("p.ckpt", "joint", 9, {"val/objects/f1_0.25": 0.01})),
-        ("novel_view", parent("occupancy")),
-        ("novel_view", parent("joint")),
-        ("novel_view", parent("shape")),
-        ("novel_view", parent("view")),
+        ("stage1", parent("stage2")),  # the first stage asks for nothing
+        ("stage2", parent("stage1", occupancy__iou=0.2)),
+        ("stage2", parent("stage2")),  # more of the same
+        ("stage3", Parent("p.ckpt", "stage2", 9, {"val/objects/f1_0.25": 0.01})),
+        ("novel_view", parent("stage1")),
+        ("novel_view", parent("stage2")),
+        ("novel_view", parent("stage3")),
+        ("novel_view", parent("novel_view")),
     ],
 )
 def test_a_parent_that_knows_its_task_will_do(experiment, found):
@@ -52,20 +52,20 @@ def test_a_parent_that_knows_its_task_will_do(experiment, found):
     [
         (
             "stage2",
-            parent("occupancy", occupancy__iou=0.0312),
+            parent("stage1", occupancy__iou=0.0312),
             r"p\.ckpt has not learned occupancy: its validation occupancy/iou is 0\.0312 and must exceed "
             r"0\.05 \(stage\.parent_minimum\): train experiment=stage1 longer, or force it with ",
         ),
-        ("stage2", parent("occupancy", occupancy__iou=float("nan")), "is nan and must exceed"),
-        ("stage2", parent("occupancy"), "has never been validated, so that its occupancy/iou is unknown"),
+        ("stage2", parent("stage1", occupancy__iou=float("nan")), "is nan and must exceed"),
+        ("stage2", parent("stage1"), "has never been validated, so that its occupancy/iou is unknown"),
         (
             "stage2",
-            parent("shape"),
-            "is of stage shape, but stage joint builds on occupancy: train experiment=stage1",
+            parent("stage3"),
+            "is of stage3, but stage2 builds on stage1: train experiment=stage1",
         ),
-        ("stage3", parent("occupancy", occupancy__iou=0.9), "builds on joint: train experiment=stage2 first"),
-        ("stage3", Parent("p.ckpt", "joint", 9, {"val/objects/f1_0.25": 0.0}), "has not learned objects"),
-        ("stage2", parent("view"), "is of stage view, but stage joint builds on occupancy"),
+        ("stage3", parent("stage1", occupancy__iou=0.9), "builds on stage2: train experiment=stage2 first"),
+        ("stage3", Parent("p.ckpt", "stage2", 9, {"val/objects/f1_0.25": 0.0}), "has not learned objects"),
+        ("stage2", parent("novel_view"), "is of novel_view, but stage2 builds on stage1"),
     ],
 )
 def test_others_are_refused_unless_forced(experiment, found, message, caplog):
@@ -77,33 +77,33 @@ def test_others_are_refused_unless_forced(experiment, found, message, caplog):
 
 
 def test_the_stage_is_asked_for_without_the_scores():
-    check_parent(parent("occupancy"), stage("stage2"), "stage")
-    with pytest.raises(CheckpointError, match="builds on occupancy"):
-        check_parent(parent("shape"), stage("stage2"), "stage")
+    check_parent(parent("stage1"), stage("stage2"), "stage")
+    with pytest.raises(CheckpointError, match="builds on stage1"):
+        check_parent(parent("stage3"), stage("stage2"), "stage")
 
 
 def test_the_minimum_is_a_setting():
-    learned = parent("occupancy", occupancy__iou=0.2)
+    learned = parent("stage1", occupancy__iou=0.2)
     with pytest.raises(CheckpointError, match=r"must exceed 0\.3"):
         check_parent(learned, stage("stage2", "stage.parent_minimum=0.3"), "scores")
 
 
 def test_what_is_remembered_of_a_parent():
-    content = {"stage": "occupancy", "global_step": 7, "scores": {"val/occupancy/iou": 0.5, "step": 6}}
+    content = {"stage": "stage1", "global_step": 7, "scores": {"val/occupancy/iou": 0.5, "step": 6}}
     found = Parent.of(Path("p.ckpt"), content)
     assert found.as_plain() == {
         "path": "p.ckpt",
-        "stage": "occupancy",
+        "stage": "stage1",
         "step": 7,
         "scores": {"val/occupancy/iou": 0.5, "step": 6.0},
         "data": None,
     }
     known = {"name": "rooms", "root": "r", "annotation": "ab", "made": {"seed": 0}}
     assert Parent.of(Path("p.ckpt"), content | {"data": known}).data == known
-    assert Parent.of(Path("p.ckpt"), {"stage": "occupancy"}).scores == {}
+    assert Parent.of(Path("p.ckpt"), {"stage": "stage1"}).scores == {}
     for odd in ({"scores": {"a": "b"}}, {"global_step": "many"}):
         with pytest.raises(CheckpointError, match=r"p\.ckpt"):
-            Parent.of(Path("p.ckpt"), {"stage": "occupancy", **odd})
+            Parent.of(Path("p.ckpt"), {"stage": "stage1", **odd})
 
 
 def find(outputs, experiment, *more):
@@ -117,10 +117,10 @@ def finished(outputs, name, data, *, old=False):
     """A finished stage 1; an old one does not say in its mark what it was trained on."""
     run = outputs / "tiny" / "stage1" / name
     config = plain(compose("train", ["preset=tiny", "output_dir=unused", *data]))
-    card = checkpoint_card(stage="occupancy", preset="tiny", config=config, parent=None)
+    card = checkpoint_card(stage="stage1", preset="tiny", config=config, parent=None)
     write_checkpoint(run / LAST, {**card, "state_dict": {}})
     known = None if old else card["data"]
-    write_finished(run, stage="occupancy", preset="tiny", experiment="stage1", steps=4, data=known)
+    write_finished(run, stage="stage1", preset="tiny", experiment="stage1", steps=4, data=known)
     return run / LAST
 
 

@@ -43,16 +43,16 @@ def test_the_parent_is_named_with_its_score():
     cfg = compose("train", ["preset=tiny", "experiment=stage2", "output_dir=unused"])
     module = build_module(cfg, build_model(cfg))
     scores = {"val/occupancy/iou": 0.41234, "val/total": 3.0}
-    parent = {"path": "a/last.ckpt", "stage": "occupancy", "step": 1500, "scores": scores}
+    parent = {"path": "a/last.ckpt", "stage": "stage1", "step": 1500, "scores": scores}
     last = start_report(module.stage, module.model, card(cfg, parent))[-1]
-    assert last == "starts from stage occupancy, step 1500, val/occupancy/iou 0.412: a/last.ckpt"
+    assert last == "starts from stage1, step 1500, val/occupancy/iou 0.412: a/last.ckpt"
 
 
 def test_a_parent_on_other_data_is_said_in_one_line():
     typed = ["preset=tiny", "experiment=stage2", "output_dir=unused"]
     cfg = compose("train", [*typed, "data=scan2cad", "data.root=real"])
     module = build_module(cfg, build_model(cfg))
-    parent = {"path": "a/last.ckpt", "stage": "occupancy", "step": 1500, "scores": {}}
+    parent = {"path": "a/last.ckpt", "stage": "stage1", "step": 1500, "scores": {}}
     rooms = KnownData.of_config(plain(compose("train", [*typed, "data.root=rooms"]))).as_plain()
     line = "its parent was trained on other data, rooms in rooms; this run on scan2cad in real"
     assert line in start_report(module.stage, module.model, card(cfg, parent | {"data": rooms}))
@@ -91,17 +91,18 @@ def test_settings_that_change_in_a_resumed_run_are_named():
     ]
 
 
-@pytest.mark.parametrize("experiment", ["stage2", "gt_masks_stage2"])
-def test_settings_that_came_later_are_no_change(experiment):
+@pytest.mark.parametrize("masks", [False, True])
+def test_settings_that_came_later_are_no_change(masks):
     """A run from before there were keys for what it did goes on without a word, unless they say otherwise."""
-    typed = ["preset=tiny", f"experiment={experiment}", "output_dir=unused"]
+    typed = ["preset=tiny", "experiment=stage2", "output_dir=unused"] + ["variant=gt_masks"] * masks
     before = plain(compose("train", typed))
     for key in ("shape_layers", "center_beta", "yaw_beta"):
         del before["loss"][key]
     for key in ("class_cost", "center_beta", "yaw_beta"):
         del before["loss"]["matcher"][key]
     del before["data"]["name"], before["data"]["dataset"]["object_choice"]
-    before["data"]["dataset"]["input_mask"] = experiment != "stage2"
+    before["data"]["dataset"]["input_mask"] = masks
+    del before["variant_prefix"]
     assert changed_settings(before, plain(compose("train", typed))) == []
     more = ["loss.shape_layers=all", "data.dataset.object_choice=seen", "loss.yaw_beta=0.2"]
     assert sorted(changed_settings(before, plain(compose("train", [*typed, *more])))) == [

@@ -64,7 +64,7 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     model = _network(cfg)
     cfg = _in_its_preset(cfg, settings)
     # The stages before it leave the shape head untrained.
-    tasks = TASKS_WITH_SHAPE if settings.stage == "shape" else TASKS
+    tasks = TASKS_WITH_SHAPE if settings.stage == "stage3" else TASKS
     _make_data_fit(cfg, settings, model, tasks)
     data = build_data(cfg)
     data.prepare_data()
@@ -74,7 +74,7 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
         "checkpoint": str(cfg.checkpoint),
         "max_objects": cfg.max_objects,
     }
-    if settings.stage == "view":
+    if settings.stage == "novel_view":
         metrics = evaluate_views(model, scenes, output=output, views_at_once=cfg.views_at_once, about=about)
         Console().print(views_table(metrics, title=f"{settings.preset}, {title}"))
         _log.info("wrote %s: %s", output.resolve(), ", ".join(FILES))
@@ -125,7 +125,7 @@ def _make_data_fit(
     cfg.views.num_views = cfg.num_views or settings.num_views
     if "shape" in tasks:
         cfg.stage.targets = [*cfg.stage.targets, "shapes"]
-    if settings.stage == "view":
+    if settings.stage == "novel_view":
         cfg.stage.targets = []
     else:
         cfg.stage.new_views = 0

@@ -70,7 +70,7 @@ def described(checkpoint: Mapping[str, Any], path: Path) -> Table:
         "preset": checkpoint["preset"],
         "stage": checkpoint["stage"],
         "steps": checkpoint.get("global_step"),
-        "parent": f"stage {parent['stage']}, {parent['step']} steps" if parent else None,
+        "parent": f"{parent['stage']}, {parent['step']} steps" if parent else None,
         "trained on": str(known) if (known := KnownData.of_checkpoint(checkpoint)) else None,
         "weights": f"{sum(value.numel() for value in weights) / 1e6:.2f} M, {', '.join(dtypes)}",
         "images": f"{views.get('image_size')}, {views.get('predict_views')} a scene",

@@ -31,13 +31,14 @@ from raytran.viewer.viewed import read_truth, viewed_volumes
 _LOG = logging.getLogger(__name__)
 
 _UNTRAINED = {
-    "occupancy": "its objects mean nothing yet; predict with a checkpoint of stage shape",
-    "joint": "it has learned no shapes yet, so there are boxes but no meshes: those need stage shape",
-    "view": "it renders new views; its objects mean nothing unless stage.trainable left the backbone alone",
+    "stage1": "its objects mean nothing yet; predict with a checkpoint of stage3",
+    "stage2": "it has learned no shapes yet, so there are boxes but no meshes: those need stage3",
+    "novel_view": "it renders new views; its objects mean nothing unless stage.trainable left the backbone "
+    "alone",
 }
 """Stage of the curriculum that is not the last → what to expect of its checkpoints."""
 
-_WITHOUT_SHAPES = ("occupancy", "joint")
+_WITHOUT_SHAPES = ("stage1", "stage2")
 """Stages before that of the shapes. The surface of their noise has a quarter of a million triangles."""
 
 RGB = 3
@@ -64,7 +65,7 @@ def predict(cfg: DictConfig) -> Path:
         shapenet_version(Path(cfg.cads))  # It raises where there are none, before the network runs.
     settings = prediction_settings(cfg.checkpoint)
     if settings.stage in _UNTRAINED:
-        _LOG.warning("%s is of stage %s: %s", cfg.checkpoint, settings.stage, _UNTRAINED[settings.stage])
+        _LOG.warning("%s is of %s: %s", cfg.checkpoint, settings.stage, _UNTRAINED[settings.stage])
     device = choose_device(cfg.device)
     set_matmul_precision(cfg.matmul_precision, device)
     model = load_model(cfg.checkpoint, attention=cfg.attention, trust=trusted_packages(cfg.trust))

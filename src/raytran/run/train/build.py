@@ -114,7 +114,7 @@ def build_trainer(cfg: DictConfig, run: RunConfig, card: dict[str, Any]) -> pl.T
         *_monitors(cfg, folder, card["config"]),
     ]
     if run.progress_bar == "rich":
-        callbacks.append(StepProgress(f"stage {card['stage']}"))
+        callbacks.append(StepProgress(card["stage"]))
     elif run.progress_bar == "tqdm":
         callbacks.append(TQDMProgressBar())
     loggers = [instantiate(logger, _convert_="all") for logger in plain(cfg.logger).values()]

@@ -50,10 +50,14 @@ def run_curriculum(
         stages: experiments, in order.
 
     Raises:
-        ConfigError: ``overrides`` names an experiment, or the folder holds a curriculum with other settings.
+        ConfigError: ``overrides`` names an experiment, there is no such setting or stage, or the folder holds
+            a curriculum with other settings.
     """
     if any(item.startswith("experiment=") for item in overrides):
         raise ConfigError(f"a curriculum runs the experiments {list(stages)}: choose them with stages=[…]")
+    presets = [
+        compose("train", [*overrides, f"experiment={name}", "output_dir=none"]).preset for name in stages
+    ]
     _record(output_dir, overrides, stages)
     results: list[FitResult] = []
     for number, experiment in enumerate(stages, start=1):
@@ -66,7 +70,7 @@ def run_curriculum(
     write_finished(
         output_dir,
         stage="curriculum",
-        preset=_preset(overrides),
+        preset=presets[-1],
         experiment="curriculum",
         steps=results[-1].steps,
     )
@@ -132,7 +136,3 @@ def _record(output_dir: Path, overrides: Sequence[str], stages: Sequence[str]) -
         f"{output_dir} holds an unfinished curriculum that was started with {typed}: "
         "give the same to continue it, or resume=none to start a new one"
     )
-
-
-def _preset(overrides: Sequence[str]) -> str:
-    return str(compose("train", [*overrides, "output_dir=none"]).preset)

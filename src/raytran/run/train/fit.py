@@ -101,7 +101,7 @@ def _train(cfg: DictConfig, run: RunConfig, folder: Path) -> FitResult:
     data = build_data(cfg)
     if trainer.is_global_zero:
         _describe_run(cfg, folder)
-    _log.info("stage %s, %d steps, in %s", module.stage.name, trainer.max_steps, folder)
+    _log.info("%s, %d steps, in %s", module.stage.name, trainer.max_steps, folder)
     for line in start_report(module.stage, module.model, card, trust=run.trust):
         _log.info("%s", line)
     warning = cudnn_warning(device, str(trainer.precision))
@@ -128,7 +128,7 @@ def _train(cfg: DictConfig, run: RunConfig, folder: Path) -> FitResult:
             data=KnownData.of_config(config).as_plain(),
         )
     metrics = {name: float(value) for name, value in trainer.logged_metrics.items()}
-    _log.info("stage %s finished after %.0f s: %s", module.stage.name, seconds, folder / LAST)
+    _log.info("%s finished after %.0f s: %s", module.stage.name, seconds, folder / LAST)
     return FitResult(folder, folder / LAST, trainer.global_step, seconds, metrics)
 
 
@@ -143,7 +143,7 @@ def _finished_before(run: RunConfig, folder: Path) -> FitResult | None:
         return None
     if finished is None:
         return None
-    _log.info("%s has finished already (stage %s, %d steps)", folder, finished.stage, finished.steps)
+    _log.info("%s has finished already (%s, %d steps)", folder, finished.stage, finished.steps)
     return FitResult(folder, folder / finished.checkpoint, finished.steps, 0.0, {})
 
 
@@ -175,7 +175,7 @@ def _start(cfg: DictConfig, run: RunConfig) -> _Start:
         module = build_module(cfg, build_model(cfg, pretrained=False))
         if content["stage"] != module.stage.name:
             raise CheckpointError(
-                f"{path} is of stage {content['stage']}, not {module.stage.name}: choose the experiment "
+                f"{path} is of {content['stage']}, not {module.stage.name}: choose the experiment "
                 f"that wrote it, or start a new run from its weights with init_from={path}"
             )
         load_weights(module.model, content, path)

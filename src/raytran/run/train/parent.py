@@ -95,12 +95,12 @@ def _no_parent(run: RunConfig, stage: Stage, data: KnownData, others: list[str])
     where = f"under {Path(run.outputs).resolve()}"
     if not others:
         return (
-            f"no finished run of stage {stage.parent} with preset {run.preset} {where}: run {first}` first, "
+            f"no finished run of {stage.parent} with preset {run.preset} {where}: run {first}` first, "
             "or give init_from=CHECKPOINT, or init_from=none to start from scratch"
         )
     more = f" and {len(others) - 1} more" if len(others) > 1 else ""
     return (
-        f"no finished run of stage {stage.parent} with preset {run.preset} {where} "
+        f"no finished run of {stage.parent} with preset {run.preset} {where} "
         f"was trained on {data}, only on other data ({others[0]}{more}): run {first} {data.typed()}` first, "
         "or give init_from=CHECKPOINT to start from other data all the same, or init_from=none to start "
         "from scratch"
@@ -122,9 +122,7 @@ def check_parent(parent: Parent, stage: Stage, check: str) -> None:
         return
     again = f"train experiment={stage.parent_experiment}"
     if parent.stage != stage.parent:
-        objection = (
-            f"{parent.path} is of stage {parent.stage}, but stage {stage.name} builds on {stage.parent}"
-        )
+        objection = f"{parent.path} is of {parent.stage}, but {stage.name} builds on {stage.parent}"
         if check == "none":
             _log.warning("%s", objection)
             return

@@ -13,7 +13,7 @@ from raytran.training.stage import Stage
 
 _NOT_COMPUTED = {
     *("output_dir", "outputs", "resume", "init_from", "check_parent", "progress_bar", "logger", "launcher"),
-    *("stages", "debug", "sweep", "watch", "optimized_metric", "trust"),
+    *("stages", "debug", "sweep", "watch", "optimized_metric", "trust", "variant_prefix"),
 }
 """Top-level settings that say where and how a run goes on, not what it computes."""
 
@@ -62,7 +62,7 @@ def start_report(
         told = [
             f"{name} {value:.3g}" for name, value in scores.items() if name == f"val/{stage.parent_score}"
         ]
-        at = f"stage {parent['stage']}, step {parent['step']}"
+        at = f"{parent['stage']}, step {parent['step']}"
         lines.append(f"starts from {', '.join([at, *told])}: {parent['path']}")
         known, data = KnownData.of_plain(parent.get("data")), KnownData.of_plain(card["data"])
         if known is not None and data is not None and not known.is_same(data):
