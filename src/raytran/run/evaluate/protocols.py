@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
+import numpy as np
 from torch import Tensor
 
 from raytran.data.scan2cad import SceneAnnotation, read_annotations, scene_alignments, scene_objects
@@ -18,6 +18,7 @@ from raytran.errors import ConfigError, DataError
 from raytran.metrics.atlas import ErrorAtlas
 from raytran.metrics.bootstrap import (
     Comparison,
+    Counts,
     Interval,
     Statistic,
     bootstrap_interval,
@@ -245,11 +246,11 @@ def _classes(scores: ProtocolScores) -> list[str]:
     return [name for name, entry in scores.metrics.get("per_class", {}).items() if entry["n_total"]]
 
 
-def _counts(number: str, scores: ProtocolScores, names: Sequence[str], classes: Sequence[str]) -> Tensor:
+def _counts(number: str, scores: ProtocolScores, names: Sequence[str], classes: Sequence[str]) -> Counts:
     """Return what each scene adds to the sums behind a number, ``(S, C)``."""
     if not number.startswith("f1_"):
         return class_counts([row for row in scores.objects if row["category"] in classes], names, classes)
     by_name = {row["scene_id"]: row for row in scores.scenes}
     columns = (number.replace("f1", "n_matched"), "n_predicted", "n_true")
     rows = [[float(by_name[name][column] or 0) for column in columns] for name in names]
-    return torch.tensor(rows, dtype=torch.float64).reshape(len(names), len(columns))
+    return np.array(rows, dtype=np.float64).reshape(len(names), len(columns))
