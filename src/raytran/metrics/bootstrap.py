@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import bootstrap, permutation_test
 
-from raytran.metrics.records import Row
+from raytran.metrics.per_scene import Row
 from raytran.structs import CLASSES
 
 Counts = NDArray[np.float64]

@@ -11,13 +11,13 @@ import torch
 from torch import nn
 from torchmetrics import Metric
 
-from raytran.metrics.atlas import ErrorAtlas
-from raytran.metrics.curves import AccuracyCurves
+from raytran.metrics.accuracy_curves import AccuracyCurves
+from raytran.metrics.box_f1 import OrientedBoxF1
+from raytran.metrics.error_atlas import ErrorAtlas
+from raytran.metrics.iou import ForegroundIoU, SceneOccupancyIoU
 from raytran.metrics.new_views import NewViewScores
-from raytran.metrics.odam import OrientedBoxF1
-from raytran.metrics.records import Row
+from raytran.metrics.per_scene import Row
 from raytran.metrics.scan2cad import Scan2CADAccuracy
-from raytran.metrics.scene import ForegroundIoU, SceneOccupancyIoU
 from raytran.metrics.shape import MatchedShapeScores
 from raytran.postprocess import select_objects
 from raytran.structs import ObjectSet, SceneBatch, ScenePrediction

@@ -21,7 +21,7 @@ from raytran.checkpoints.checkpoint import PredictionSettings, load_model, predi
 from raytran.checkpoints.network import trusted_packages
 from raytran.data.views import RepeatedFrames
 from raytran.errors import ConfigError
-from raytran.metrics.curves import accuracy_by_scene_size
+from raytran.metrics.accuracy_curves import accuracy_by_scene_size
 from raytran.model import RayTran
 from raytran.pictures.accuracy_curves import FILE as FIGURE
 from raytran.run.device import choose_device, set_matmul_precision

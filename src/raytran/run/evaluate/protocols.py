@@ -15,7 +15,7 @@ from torch import Tensor
 from raytran.data.scan2cad import SceneAnnotation, read_annotations, scene_alignments, scene_objects
 from raytran.data.scannet.scan import read_scan
 from raytran.errors import ConfigError, DataError
-from raytran.metrics.atlas import ErrorAtlas
+from raytran.metrics.accuracy_curves import AccuracyCurves, accuracy_by_scene_size
 from raytran.metrics.bootstrap import (
     Comparison,
     Counts,
@@ -28,10 +28,10 @@ from raytran.metrics.bootstrap import (
     f1,
     global_average,
 )
-from raytran.metrics.curves import AccuracyCurves, accuracy_by_scene_size
+from raytran.metrics.box_f1 import OrientedBoxF1
+from raytran.metrics.error_atlas import ErrorAtlas
 from raytran.metrics.functional.cad_errors import cad_symmetries
-from raytran.metrics.odam import OrientedBoxF1
-from raytran.metrics.records import Row
+from raytran.metrics.per_scene import Row
 from raytran.metrics.scan2cad import Scan2CADAccuracy
 from raytran.run.evaluate.files import CadBoxes, PredictionFiles
 from raytran.structs import CadAlignments, ObjectSet

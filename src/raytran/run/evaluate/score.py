@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 from rich.console import Console
 
 from raytran.errors import ConfigError
-from raytran.metrics.records import Row
+from raytran.metrics.per_scene import Row
 from raytran.pictures.accuracy_curves import FILE as FIGURE
 from raytran.run.evaluate.figure import Curves, draw_figure
 from raytran.run.evaluate.files import PredictionFiles, read_predictions
