@@ -24,6 +24,7 @@ from raytran.run.demo.page import COLUMNS, ShownScene, headline, write_page
 from raytran.run.demo.steps import StepTimes
 from raytran.run.entry import compose
 from raytran.run.evaluate.evaluate import TASKS_WITH_SHAPE, about_data, evaluate_model
+from raytran.run.evaluate.results import write_evaluation
 from raytran.run.predict.files import write_scene
 from raytran.run.predict.predict import predict_scene
 from raytran.run.train.build import build_data, plain
@@ -159,15 +160,16 @@ def _asked(overrides: Sequence[str], data: SceneDataModule, checkpoint: Path) ->
 
 def _evaluate(cfg: DictConfig, asked: Asked, output: Path) -> dict[str, Any]:
     about = {"checkpoint": str(asked.checkpoint), **about_data(asked.data, asked.split, asked.num_views)}
-    return evaluate_model(
+    evaluation = evaluate_model(
         asked.model,
         asked.data.split(asked.split),
         tasks=TASKS_WITH_SHAPE,
-        output=output,
         score_threshold=cfg.score_threshold,
         duplicate_iou=cfg.duplicate_iou,
         about=about,
     )
+    write_evaluation(output, evaluation)
+    return evaluation.metrics
 
 
 def _predict_first(cfg: DictConfig, name: str, asked: Asked, output: Path) -> ShownScene:

@@ -11,9 +11,9 @@ import trimesh
 
 from raytran.errors import ConfigError
 from raytran.export import write_prediction
+from raytran.export.cad_alignments import ALIGNMENTS, write_alignments_csv
 from raytran.export.glb import write_glb
 from raytran.export.nearest_cad import NearestCads, nearest_cads
-from raytran.export.scan2cad_csv import ALIGNMENTS, write_alignments_csv
 from raytran.geometry.camera import Cameras
 from raytran.pictures.overlay import draw_overlays
 from raytran.pictures.topdown import draw_topdown
