@@ -32,9 +32,9 @@ from raytran.ops.tracer import RayTracer
 from raytran.ops.triton import block_pairs
 from raytran.run.entry import compose
 from raytran.run.evaluate.evaluate import TASKS_WITH_SHAPE, evaluate_model
-from raytran.run.predict.predict import predict_scene
-from raytran.run.predict.render import render_views
-from raytran.run.predict.room import RoomViews, predict_room
+from raytran.run.predict.new_views import render_views
+from raytran.run.predict.predict import predict_room, predict_scene
+from raytran.run.predict.room import RoomViews
 from raytran.run.replay import run_step
 from raytran.run.train.build import build_model, build_module, build_trainer, plain
 from raytran.run.train.settings import RunConfig
@@ -379,7 +379,8 @@ def test_evaluation_and_prediction(network):
             views_at_once=1,
             progress=False,
         ).metrics
-        scene = predict_scene(model, views, with_shapes=False, **limits)
+        alone = RoomViews.in_one_volume(views, ("0", "1"), model)
+        scene = predict_scene(model, alone, with_shapes=False, **limits)
         center = views.world_from_camera[0, :, :3, 3].mean(dim=0).double()
         volumes = Volumes(
             GRID, model.grid_extent, torch.stack([center, center + torch.tensor([1.5, 0.0, 0.0])])
