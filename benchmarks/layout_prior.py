@@ -19,7 +19,7 @@ from torch import Tensor
 from raytran.data.scan2cad import read_annotations, scene_objects
 from raytran.data.scannet.scan import read_scan
 from raytran.data.scene_list import read_split
-from raytran.export.scene_json import write_scene_json
+from raytran.export import write_scene_json
 from raytran.geometry.rotation import rotation_from_yaw, yaw_from_rotation
 from raytran.structs import ObjectSet, ScenePrediction
 

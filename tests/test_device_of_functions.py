@@ -27,11 +27,9 @@ from raytran.geometry.rotation import (
 )
 from raytran.geometry.volumes import Volumes, cover
 from raytran.metrics.functional.alignment import alignment_errors
-from raytran.metrics.functional.box_f1 import average_precision, best_f1
-from raytran.metrics.functional.matching import match_in_order, score_order
+from raytran.metrics.functional.detection import average_precision, best_f1, match_in_order, score_order
 from raytran.metrics.functional.shape import chamfer_distance, surface_points
-from raytran.metrics.image import psnr_of_frames
-from raytran.metrics.new_views import nearest_frames
+from raytran.metrics.new_views import nearest_frames, psnr_of_frames
 from raytran.ops import reference
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_attention import ray_attention

@@ -32,10 +32,9 @@ from raytran.ops.tracer import RayTracer
 from raytran.ops.triton import block_pairs
 from raytran.run.entry import compose
 from raytran.run.evaluate.evaluate import TASKS_WITH_SHAPE, evaluate_model
-from raytran.run.evaluate.views import evaluate_views
-from raytran.run.predict.predict import predict_scene
-from raytran.run.predict.render import render_views
-from raytran.run.predict.room import RoomViews, predict_room
+from raytran.run.predict.new_views import render_views
+from raytran.run.predict.predict import predict_room, predict_scene
+from raytran.run.predict.room import RoomViews
 from raytran.run.train.build import build_model, build_module, build_trainer, plain
 from raytran.run.train.settings import RunConfig
 from raytran.structs import SHAPE_SIZE, ObjectSet, SceneBatch, ScenePrediction, Views
@@ -363,7 +362,7 @@ def test_a_step_on_the_kernels_equals_one_on_the_cpu(experiment):
 
 @pytest.mark.parametrize("network", NETWORKS)
 @on_pretend_device
-def test_evaluation_and_prediction(network, tmp_path):
+def test_evaluation_and_prediction(network):
     cfg = configured("stage3", network)
     model = module_of(cfg).model.to(DEVICE)
     targets = {"objects", "shapes", "occupancy", "foreground"}
@@ -375,12 +374,12 @@ def test_evaluation_and_prediction(network, tmp_path):
             model,
             scenes,
             tasks=TASKS_WITH_SHAPE,
-            output=tmp_path / "scores",
             score_threshold=0.0,
             views_at_once=1,
             progress=False,
-        )
-        scene = predict_scene(model, views, with_shapes=False, **limits)
+        ).metrics
+        alone = RoomViews.in_one_volume(views, ("0", "1"), model)
+        scene = predict_scene(model, alone, with_shapes=False, **limits)
         center = views.world_from_camera[0, :, :3, 3].mean(dim=0).double()
         volumes = Volumes(
             GRID, model.grid_extent, torch.stack([center, center + torch.tensor([1.5, 0.0, 0.0])])
@@ -388,7 +387,6 @@ def test_evaluation_and_prediction(network, tmp_path):
         every = tuple(range(VIEWS))
         room = predict_room(model, RoomViews(views, ("0", "1"), volumes, (every, every)), **limits)
     assert metrics["strict"]["n_total"] == 3
-    assert (tmp_path / "scores" / "per_object.csv").is_file()
     for prediction in (scene.prediction, room):
         assert len(prediction.objects)
         assert {tensor.device.type for tensor in tensors_in(vars(prediction.objects))} == {"cpu"}
@@ -408,7 +406,7 @@ def test_new_views(network, tmp_path):
     wanted = CameraList(("a", "b"), (lens, lens), scene.new_views.world_from_camera[0].double())
     (tmp_path / "prediction").mkdir()
     with kernels_left_out():
-        metrics = evaluate_views(model, [scene], output=tmp_path / "scores", progress=False)
+        metrics = evaluate_model(model, [scene], tasks=("view",), progress=False).metrics
         images = list(
             model.render(scene.views.to(DEVICE), Cameras.of(scene.new_views.to(DEVICE)), views_at_once=1)
         )

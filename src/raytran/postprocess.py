@@ -19,6 +19,12 @@ from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.volumes import Volumes
 from raytran.structs import ObjectSet, ScenePrediction
 
+SCORE_THRESHOLD = 0.5
+"""Least score of an object that counts as predicted, unless another is asked for."""
+
+DUPLICATE_IOU = 0.25
+"""Of two objects of one class whose boxes overlap more, the one with the lower score does not count."""
+
 _POINTS_PER_SIDE = 4
 """A box is sampled at so many points along each side to see how many views saw it."""
 
@@ -31,7 +37,10 @@ _NEARLY_OWN = 0.25
 
 
 def select_objects(
-    prediction: ScenePrediction, *, score_threshold: float = 0.5, duplicate_iou: float | None = None
+    prediction: ScenePrediction,
+    *,
+    score_threshold: float = SCORE_THRESHOLD,
+    duplicate_iou: float | None = None,
 ) -> ScenePrediction:
     """Keep the objects that are sure enough, highest score first.
 

@@ -15,7 +15,8 @@ import raytran
 from raytran.data.scannet.scan import open_scan
 from raytran.errors import ConfigError
 from raytran.run.entry import compose
-from raytran.run.evaluate.views import evaluate_views
+from raytran.run.evaluate.evaluate import evaluate_model
+from raytran.run.evaluate.results import write_evaluation
 from raytran.run.predict.predict import predict
 from raytran.run.train.build import build_data
 from raytran.run.train.fit import train
@@ -44,7 +45,9 @@ def test_evaluation_says_what_validation_said(trained, settings, tmp_path):
     _, fit = trained
     cfg = compose("train", [*settings, "experiment=novel_view", "stage.new_views=2", "output_dir=unused"])
     model, dataset = raytran.load(fit.checkpoint), build_data(cfg).split("val")
-    metrics = evaluate_views(model, dataset, output=tmp_path / "out", progress=False)
+    evaluation = evaluate_model(model, dataset, tasks=("view",), progress=False)
+    write_evaluation(tmp_path / "out", evaluation)
+    metrics = evaluation.metrics
     scores = torch.load(fit.checkpoint, weights_only=True)["scores"]
     assert metrics["new_views"]["n_views"] == 2
     for name in ("psnr", "ssim", "psnr_best_constant", "psnr_nearest_frame"):

@@ -252,6 +252,7 @@ def test_evaluate_writes_numbers(trained, rooms, tmp_path, command):
     assert 0 <= metrics["foreground_iou"] <= 1
     assert sorted(path.name for path in (tmp_path / "results").iterdir()) == [
         "accuracy_curves.png",
+        "atlas.json",
         "metrics.json",
         "per_object.csv",
         "per_scene.csv",

@@ -13,7 +13,9 @@ import torch
 import trimesh
 
 from raytran.errors import DataError, ShapeError
-from raytran.export import read_scene_json, write_prediction
+from raytran.export import read_scene_json, write_meshes, write_prediction, write_scene_json
+from raytran.export.glb import object_name
+from raytran.export.write import write_occupancy
 from raytran.structs import ObjectSet, ScenePrediction
 
 
@@ -113,3 +115,74 @@ def test_damaged_files_are_named(tmp_path, content, message):
     with pytest.raises(DataError, match=message) as caught:
         read_scene_json(path)
     assert str(path) in str(caught.value)
+
+
+def test_files_of_a_mesh_hold_the_same_mesh_in_the_world(tmp_path, prediction, box_at):
+    names = write_meshes(tmp_path, prediction.objects, [box_at([1, 2, 0.5]), None])
+    assert names == ["meshes/00.ply", None]
+    assert {path.name for path in (tmp_path / "meshes").iterdir()} == {"00.ply", "00.obj", "00.mtl"}
+    ply = trimesh.load(tmp_path / "meshes" / "00.ply", process=False)
+    assert np.allclose(ply.bounds, [[0.75, 1.7, 0.0], [1.25, 2.3, 1.0]])
+    assert ply.visual.vertex_colors[0].tolist() == [31, 119, 180, 255]
+    obj = trimesh.load(tmp_path / "meshes" / "00.obj", process=False)
+    assert np.allclose(obj.vertices, ply.vertices, atol=1e-5)
+    assert np.array_equal(obj.faces, ply.faces)
+    assert obj.visual.material.main_color.tolist() == [31, 119, 180, 255]
+    lines = (tmp_path / "meshes" / "00.obj").read_text().splitlines()
+    assert {"mtllib 00.mtl", "o 00_chair", "usemtl chair"} <= set(lines)
+
+
+def test_names(prediction):
+    assert [object_name(prediction.objects, i) for i in range(2)] == ["00_chair", "01_table"]
+
+
+def test_three_js_reads_the_obj(tmp_path, prediction, box_at, read_three):
+    write_meshes(tmp_path, prediction.objects, [None, box_at([1, 2, 0.5])])
+    found = read_three(tmp_path / "meshes" / "01.obj")
+    assert list(found) == ["01_table"]
+    assert np.allclose(found["01_table"]["low"], [0.75, 1.7, 0.0])
+    assert np.allclose(found["01_table"]["high"], [1.25, 2.3, 1.0])
+    assert found["01_table"]["color"] == "2ca02c"
+
+
+def test_points_lie_where_the_voxels_are(tmp_path):
+    occupancy = torch.full((4, 4, 2), 0.5)
+    occupancy[1, 2, 0], occupancy[0, 0, 1] = 0.75, 1.0
+    path = write_occupancy(
+        tmp_path / "o.ply", occupancy, center=torch.tensor([10.0, 0, 1]), extent=(4.0, 8.0, 2.0)
+    )
+    cloud = trimesh.load(path)
+    # Voxels of 1 x 2 x 1 m from (8, -4, 0) on; z runs fastest.
+    assert cloud.vertices.tolist() == [[8.5, -3.0, 1.5], [9.5, 1.0, 0.5]]
+    # The last and the middle of viridis' 256 colours.
+    assert cloud.colors[:, :3].tolist() == [[253, 231, 36], [32, 144, 140]]
+    points = np.frombuffer(
+        path.read_bytes().split(b"end_header\n")[1], dtype=[("xyz", "<f4", 3), ("rgb", "u1", 3), ("p", "<f4")]
+    )
+    assert points["p"].tolist() == [1.0, 0.75]
+
+
+def test_nothing_is_occupied(tmp_path):
+    path = write_occupancy(
+        tmp_path / "o.ply", torch.zeros(2, 2, 2), center=torch.zeros(3), extent=(1.0, 1.0, 1.0)
+    )
+    assert path.read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\nelement vertex 0\n")
+    assert path.read_bytes().endswith(b"end_header\n")
+
+
+def test_few_views_lower_the_confidence_and_not_the_score(tmp_path, prediction):
+    objects = replace(
+        prediction.objects, score=torch.tensor([0.9, 0.8]), num_views=torch.tensor([1.0, 19.04])
+    )
+    path = write_scene_json(tmp_path / "scene.json", replace(prediction, objects=objects), [None, None])
+    few, many = json.loads(path.read_text())["objects"]
+    assert (few["num_views"], many["num_views"]) == (1.0, 19.0)
+    assert (few["score"], many["score"]) == pytest.approx((0.9, 0.8))
+    assert few["confidence"] == pytest.approx(0.45)
+    assert many["confidence"] == pytest.approx(0.8 * 19.04 / 20.04)
+    assert read_scene_json(path).objects.score.tolist() == pytest.approx([0.9, 0.8])
+
+
+def test_without_counted_views_nothing_is_said_of_them(tmp_path, prediction):
+    path = write_scene_json(tmp_path / "scene.json", prediction, [None, None])
+    assert not {"num_views", "confidence"} & set(json.loads(path.read_text())["objects"][0])

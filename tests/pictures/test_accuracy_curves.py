@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.metrics.curves import AccuracyCurves
+from raytran.metrics.accuracy_curves import AccuracyCurves
 from raytran.pictures.accuracy_curves import accuracy_figure, draw_accuracy_curves
 from raytran.structs import ObjectSet
 

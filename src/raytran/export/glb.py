@@ -13,7 +13,6 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from raytran.export.mesh import object_name
 from raytran.geometry.camera import Cameras
 from raytran.structs import CLASS_COLORS, CLASSES, ObjectSet
 
@@ -27,6 +26,11 @@ _EDGE = 0.008
 
 _NEAR = 0.05
 """Near plane of the cameras, metres."""
+
+
+def object_name(objects: ObjectSet, index: int) -> str:
+    """Return what an object is called in every file, e.g. ``00_chair``."""
+    return f"{index:02d}_{CLASSES[int(objects.label[index])]}"
 
 
 def write_glb(

@@ -21,7 +21,7 @@ from raytran.data.shapenet.voxelize import voxelize_solid
 from raytran.data.targets import object_meshes
 from raytran.data.workers import work_on
 from raytran.errors import DataError
-from raytran.export.alignments import align_cads
+from raytran.export.cad_alignments import align_cads
 from raytran.structs import CLASS_BY_CATID, CLASSES, SHAPE_SIZE, CadAlignments, ObjectSet
 
 _log = logging.getLogger(__name__)

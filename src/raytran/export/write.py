@@ -1,20 +1,42 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write everything a prediction holds into one folder."""
+"""A prediction as files: ``scene.json``, ``scene.glb``, PLY and OBJ of each object, ``occupancy.ply``."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import trimesh
+from matplotlib import colormaps
+from torch import Tensor
 
+from raytran.data.files import write_text
 from raytran.errors import ShapeError
-from raytran.export.glb import write_glb
-from raytran.export.mesh import write_meshes
-from raytran.export.occupancy import write_occupancy
-from raytran.export.scene_json import write_scene_json
+from raytran.export.glb import object_name, write_glb
 from raytran.geometry.camera import Cameras
-from raytran.structs import ScenePrediction
+from raytran.geometry.grid import VoxelGrid
+from raytran.geometry.rotation import yaw_from_rotation
+from raytran.structs import CLASS_COLORS, CLASSES, ObjectSet, ScenePrediction
+
+FORMAT = "raytran.scene/1"
+"""Value of ``format``; the number rises when a reader of the old form could misread the new one."""
+
+_OBJ_DECIMALS = 5
+"""Digits behind the point in an OBJ: a hundredth of a millimetre."""
+
+_OCCUPIED = 0.5
+"""Voxels with a higher probability are points."""
+
+# trimesh writes no cloud without points, and no numbers of our own.
+_PROPERTIES = {
+    **dict.fromkeys(("x", "y", "z"), ("<f4", "float")),
+    **dict.fromkeys(("red", "green", "blue"), ("u1", "uchar")),
+    "probability": ("<f4", "float"),
+}
+"""Name of each property of a point in ``occupancy.ply`` → its type in numpy and in PLY."""
 
 
 def write_prediction(
@@ -62,3 +84,128 @@ def write_prediction(
         files.append(write_occupancy(path, occupancy, center=center, extent=grid_extent))
     files += [folder / name for name in names if name is not None]
     return [write_scene_json(folder / "scene.json", prediction, names), *files]
+
+
+def write_scene_json(path: Path, prediction: ScenePrediction, mesh_names: Sequence[str | None]) -> Path:
+    """Write a prediction's objects, in their order.
+
+    ``center`` and ``rotation`` are in the world of the input poses (+Z up, metres); ``size`` and ``rotation``
+    follow the object frame (x width, y height, z depth; +Y up, front -Z); ``yaw`` is in radians. Where views
+    were counted, ``num_views`` says how many saw the object's box and ``confidence`` is the score times
+    ``n / (n + 1)`` of that number: what few saw is less certain than its score.
+
+    Args:
+        path: the file; written whole or not at all.
+        prediction: its objects may be none.
+        mesh_names: for each of the ``M`` objects the mesh file relative to ``path``'s folder, or None.
+
+    Returns:
+        ``path``.
+    """
+    objects = prediction.objects
+    yaw = yaw_from_rotation(objects.rotation.double())
+    entries = []
+    for i, mesh in enumerate(mesh_names):
+        entry: dict[str, Any] = {
+            "category": CLASSES[int(objects.label[i])],
+            "score": float(objects.score[i]),
+            "center": objects.center[i].tolist(),
+            "size": objects.size[i].tolist(),
+            "rotation": objects.rotation[i].tolist(),
+            "yaw": float(yaw[i]),
+            "mesh": mesh,
+        }
+        if objects.num_views is not None:
+            views = float(objects.num_views[i])
+            entry |= {"num_views": round(views, 1), "confidence": entry["score"] * views / (views + 1)}
+        if objects.model_id and objects.model_id[i]:
+            entry["catid_cad"], entry["id_cad"] = objects.model_id[i].split("/", 1)
+        entries.append(entry)
+    content = {"format": FORMAT, "scene_id": prediction.scene_id, "up": "+z", "unit": "m", "objects": entries}
+    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+    return path
+
+
+def write_meshes(
+    folder: Path, objects: ObjectSet, meshes: Sequence[trimesh.Trimesh | None]
+) -> list[str | None]:
+    """Write ``meshes/NN.ply``, ``.obj`` and ``.mtl`` of each object that has a mesh, in place in the world.
+
+    Args:
+        folder: an existing folder.
+        objects: ``M`` objects.
+        meshes: for each object its mesh in world coordinates (metres, +Z up), or None.
+
+    Returns:
+        For each object the name of the PLY relative to ``folder``, or None.
+    """
+    (folder / "meshes").mkdir(exist_ok=True)
+    names: list[str | None] = []
+    for i, mesh in enumerate(meshes):
+        if mesh is None:
+            names.append(None)
+            continue
+        names.append(f"meshes/{i:02d}.ply")
+        _painted(mesh, int(objects.label[i])).export(folder / f"meshes/{i:02d}.ply")
+        _write_obj(folder / f"meshes/{i:02d}.obj", object_name(objects, i), mesh, int(objects.label[i]))
+    return names
+
+
+def _painted(mesh: trimesh.Trimesh, label: int) -> trimesh.Trimesh:
+    painted = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    painted.visual = trimesh.visual.ColorVisuals(painted, vertex_colors=[*CLASS_COLORS[label], 255])
+    return painted
+
+
+def _write_obj(path: Path, name: str, mesh: trimesh.Trimesh, label: int) -> None:
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False, metadata={"name": name})
+    material = trimesh.visual.material.SimpleMaterial(
+        name=CLASSES[label],
+        diffuse=[*CLASS_COLORS[label], 255],
+        ambient=[0, 0, 0, 255],
+        specular=[0, 0, 0, 255],
+    )
+    solid.visual = trimesh.visual.TextureVisuals(material=material)
+    library = path.with_suffix(".mtl")
+    text, files = trimesh.exchange.obj.export_obj(
+        solid,
+        include_normals=False,
+        return_texture=True,
+        digits=_OBJ_DECIMALS,
+        mtl_name=library.name,
+        header=None,
+    )
+    path.write_text(text.lstrip("\n"), encoding="ascii")
+    library.write_bytes(files[library.name] + b"\n")
+
+
+def write_occupancy(
+    path: Path, occupancy: Tensor, *, center: Tensor, extent: tuple[float, float, float]
+) -> Path:
+    """Write the centres of the voxels that are likely occupied as a PLY, coloured by how likely.
+
+    Colours run along matplotlib's ``viridis``, from dark violet at probability ½ to yellow at 1; the
+    probability itself is the property ``probability``.
+
+    Args:
+        path: the file.
+        occupancy: ``(X, Y, Z)`` probability.
+        center: ``(3,)`` centre of the voxel grid in the world, metres.
+        extent: sizes of the voxel grid, metres.
+
+    Returns:
+        ``path``.
+    """
+    x, y, z = occupancy.shape
+    chosen = (occupancy > _OCCUPIED).cpu()
+    centers = VoxelGrid((x, y, z), extent, center.double().cpu()).voxel_centers()[chosen].numpy()
+    probability = occupancy.double().cpu()[chosen].numpy()
+    colors = colormaps["viridis"]((probability - _OCCUPIED) / (1 - _OCCUPIED), bytes=True)
+    points = np.empty(len(centers), dtype=[(name, kind) for name, (kind, _) in _PROPERTIES.items()])
+    columns = (*centers.T, *colors[:, :3].T, probability)
+    for name, column in zip(_PROPERTIES, columns, strict=True):
+        points[name] = column
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}"]
+    lines += [f"property {kind} {name}" for name, (_, kind) in _PROPERTIES.items()]
+    path.write_bytes("\n".join([*lines, "end_header\n"]).encode("ascii") + points.tobytes())
+    return path

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """How good a prediction is: torchmetrics classes over pure functions in ``metrics.functional``."""
 
-from raytran.metrics.atlas import ErrorAtlas
-from raytran.metrics.curves import AccuracyCurves
-from raytran.metrics.image import PSNR, SSIM
-from raytran.metrics.new_views import NewViewScores
-from raytran.metrics.odam import OrientedBoxF1
+from raytran.metrics.accuracy_curves import AccuracyCurves
+from raytran.metrics.box_f1 import OrientedBoxF1
+from raytran.metrics.error_atlas import ErrorAtlas
+from raytran.metrics.iou import ForegroundIoU, SceneOccupancyIoU
+from raytran.metrics.new_views import PSNR, SSIM, NewViewScores
 from raytran.metrics.scan2cad import Scan2CADAccuracy
-from raytran.metrics.scene import ForegroundIoU, SceneOccupancyIoU
 from raytran.metrics.shape import MatchedShapeScores
 
 __all__ = [

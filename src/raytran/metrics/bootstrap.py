@@ -2,7 +2,8 @@
 """How far a number may be chance: bootstrap over scenes, and the comparison of two sets of predictions.
 
 Scenes, not objects, are drawn (Efron and Tibshirani, *An Introduction to the Bootstrap*, 1993), since the
-objects of one room are not independent of each other.
+objects of one room are not independent of each other. ``scipy.stats`` draws and counts; it resamples the
+numbers of the scenes, whose counts are then summed.
 """
 
 from __future__ import annotations
@@ -10,16 +11,22 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from typing import TypedDict
 
-import torch
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import bootstrap, permutation_test
 
-from raytran.metrics.records import Row
+from raytran.metrics.per_scene import Row
 from raytran.structs import CLASSES
 
-Statistic = Callable[[Tensor], Tensor]
-"""From summed counts ``(R, C)`` to a number each, ``(R,)``."""
+Counts = NDArray[np.float64]
+
+Statistic = Callable[[Counts], Counts]
+"""From summed counts ``(..., C)`` to a number each, ``(...,)``."""
 
 CONFIDENCE = 0.95
+
+_BATCH = 100
+"""Draws that are counted together: their counts are in memory at once."""
 
 
 class Interval(TypedDict):
@@ -47,7 +54,7 @@ class Comparison(TypedDict):
     n_scenes: int
 
 
-def class_counts(rows: Iterable[Row], scene_ids: Sequence[str], classes: Sequence[str] = CLASSES) -> Tensor:
+def class_counts(rows: Iterable[Row], scene_ids: Sequence[str], classes: Sequence[str] = CLASSES) -> Counts:
     """Return found and annotated objects of each class in each scene.
 
     Args:
@@ -57,112 +64,134 @@ def class_counts(rows: Iterable[Row], scene_ids: Sequence[str], classes: Sequenc
         classes: the ``K`` names that ``category`` may be.
 
     Returns:
-        ``(S, 2 K)`` float64: the ``K`` classes' found objects, then their annotated objects.
+        ``(S, 2 K)``: the ``K`` classes' found objects, then their annotated objects.
     """
-    position = {scene_id: index for index, scene_id in enumerate(scene_ids)}
-    counts = torch.zeros(len(scene_ids), 2, len(classes), dtype=torch.float64)
-    index = [
-        (position[str(row["scene_id"])], classes.index(str(row["category"])), bool(row["matched"]))
-        for row in rows
-        if row["scene_id"] in position
-    ]
-    if index:
-        scene, label, good = torch.tensor(index).T
-        counts[:, 0].index_put_((scene, label), good.double(), accumulate=True)
-        counts[:, 1].index_put_((scene, label), torch.ones(len(scene)).double(), accumulate=True)
-    return counts.flatten(1)
+    scene_index = {scene_id: index for index, scene_id in enumerate(scene_ids)}
+    counts = np.zeros((len(scene_ids), 2, len(classes)))
+    for row in rows:
+        scene = scene_index.get(str(row["scene_id"]))
+        if scene is not None:
+            label = classes.index(str(row["category"]))
+            counts[scene, 0, label] += bool(row["matched"])
+            counts[scene, 1, label] += 1
+    return counts.reshape(len(scene_ids), -1)
 
 
-def class_average(counts: Tensor) -> Tensor:
-    """Return the mean accuracy over the classes that occur, from ``(R, 2 K)`` of ``class_counts``."""
-    good, total = counts.unflatten(1, (2, -1)).unbind(dim=1)
-    return (good / total.clamp(min=1)).sum(dim=1) / (total > 0).sum(dim=1).clamp(min=1)
+def class_average(counts: Counts) -> Counts:
+    """Return the mean accuracy over the classes that occur, from ``(..., 2 K)`` of ``class_counts``."""
+    good, total = np.split(counts, 2, axis=-1)
+    return (good / np.maximum(total, 1)).sum(axis=-1) / np.maximum((total > 0).sum(axis=-1), 1)
 
 
-def global_average(counts: Tensor) -> Tensor:
-    """Return the share of all objects that are found, from ``(R, 2 K)`` of ``class_counts``."""
-    good, total = counts.unflatten(1, (2, -1)).sum(dim=-1).unbind(dim=1)
-    return good / total.clamp(min=1)
+def global_average(counts: Counts) -> Counts:
+    """Return the share of all objects that are found, from ``(..., 2 K)`` of ``class_counts``."""
+    good, total = (half.sum(axis=-1) for half in np.split(counts, 2, axis=-1))
+    return good / np.maximum(total, 1)
 
 
-def f1(counts: Tensor) -> Tensor:
-    """Return F1 from ``(R, 3)``: matches, predictions, annotated objects."""
-    matched, predicted, true = counts.unbind(dim=1)
-    return 2 * matched / (predicted + true).clamp(min=1)
+def f1(counts: Counts) -> Counts:
+    """Return F1 from ``(..., 3)``: matches, predictions, annotated objects."""
+    matched, predicted, true = np.moveaxis(counts, -1, 0)
+    return 2 * matched / np.maximum(predicted + true, 1)
 
 
 def bootstrap_interval(
-    counts: Tensor, statistic: Statistic, *, num_resamples: int = 2000, seed: int = 0
+    counts: Counts, statistic: Statistic, *, num_resamples: int = 2000, seed: int = 0
 ) -> Interval:
-    """Return a number and the 95 % interval of its values over scenes drawn with replacement.
+    """Return a number and the 95 % percentile interval of its values over scenes drawn with replacement.
 
     Args:
-        counts: ``(S, C)`` float64, what each scene adds to the sums that ``statistic`` is computed from.
+        counts: ``(S, C)``, what each scene adds to the sums that ``statistic`` is computed from.
         statistic: e.g. ``global_average``.
         num_resamples: how often to draw.
         seed: of the drawing; the same seed and scenes give the same interval.
     """
-    value = float(statistic(counts.sum(dim=0, keepdim=True)))
-    if not len(counts):
-        return Interval(value=value, low=value, high=value)
-    low, high = _percentiles(statistic(_weights(len(counts), num_resamples, seed) @ counts))
+    value = float(statistic(counts.sum(axis=0)))
+    low, high = _percentile_interval(
+        lambda scenes: statistic(counts[scenes].sum(axis=-2)), len(counts), value, num_resamples, seed
+    )
     return Interval(value=value, low=low, high=high)
 
 
 def compare_paired(
-    first: Tensor, second: Tensor, statistic: Statistic, *, num_resamples: int = 2000, seed: int = 0
+    first: Counts, second: Counts, statistic: Statistic, *, num_resamples: int = 2000, seed: int = 0
 ) -> Comparison:
     """Compare two results on the same scenes.
 
     Args:
-        first: ``(S, C)`` float64, as for ``bootstrap_interval``.
+        first: ``(S, C)``, as for ``bootstrap_interval``.
         second: ``(S, C)`` of the same scenes in the same order.
         statistic: e.g. ``global_average``.
-        num_resamples: number of bootstrap draws, and of permutations.
+        num_resamples: number of bootstrap draws, and of permutations; of few scenes all permutations count.
         seed: of both.
 
     Returns:
         The difference, its bootstrap interval (the same scenes drawn for both sides), and the p-value of the
         permutation test; ``significant`` if that is below 5 %.
     """
+    num_scenes = len(first)
+    # Row s and row S + s are what the two sides found in scene s: a permutation swaps such rows.
+    rows = np.concatenate([first, second])
 
-    def difference(a: Tensor, b: Tensor) -> Tensor:
-        return statistic(a) - statistic(b)
+    def difference(of_first: NDArray[np.int64], of_second: NDArray[np.int64]) -> Counts:
+        return statistic(rows[of_first].sum(axis=-2)) - statistic(rows[of_second].sum(axis=-2))
 
-    values = [float(statistic(side.sum(dim=0, keepdim=True))) for side in (first, second)]
-    observed = values[0] - values[1]
-    low = high = observed
-    p_value = 1.0
-    if len(first):
-        weights = _weights(len(first), num_resamples, seed)
-        low, high = _percentiles(difference(weights @ first, weights @ second))
-        generator = torch.Generator().manual_seed(seed + 1)
-        swap = torch.randint(0, 2, (num_resamples, len(first)), generator=generator).double()
-        moved = swap @ (second - first)
-        by_chance = difference(first.sum(dim=0) + moved, second.sum(dim=0) - moved).abs()
-        # The arrangement that was observed is one of those possible, so p is never 0.
-        p_value = (1 + int((by_chance >= abs(observed) - 1e-12).sum())) / (1 + num_resamples)
+    scenes = np.arange(num_scenes)
+    observed = float(difference(scenes, scenes + num_scenes))
+    low, high = _percentile_interval(
+        lambda drawn: difference(drawn, drawn + num_scenes), num_scenes, observed, num_resamples, seed
+    )
+    p_value = 1.0  # of a single scene: swapping its sides leaves the difference as large as it was
+    if num_scenes > 1:
+        test = permutation_test(
+            (scenes, scenes + num_scenes),
+            lambda x, y, axis: np.abs(difference(np.moveaxis(x, axis, -1), np.moveaxis(y, axis, -1))),
+            permutation_type="samples",
+            vectorized=True,
+            n_resamples=num_resamples,
+            batch=_BATCH,
+            alternative="greater",
+            rng=np.random.default_rng(seed + 1),
+        )
+        p_value = float(test.pvalue)
     return Comparison(
-        first=values[0],
-        second=values[1],
+        first=float(statistic(first.sum(axis=0))),
+        second=float(statistic(second.sum(axis=0))),
         difference=observed,
         low=low,
         high=high,
         p_value=p_value,
         significant=p_value < 1 - CONFIDENCE,
-        n_scenes=len(first),
+        n_scenes=num_scenes,
     )
 
 
-def _weights(num_scenes: int, num_resamples: int, seed: int) -> Tensor:
-    """Return how often each scene is drawn, ``(R, S)`` float64 with rows that sum to ``S``."""
-    generator = torch.Generator().manual_seed(seed)
-    drawn = torch.randint(0, num_scenes, (num_resamples, num_scenes), generator=generator)
-    weights = torch.zeros(num_resamples, num_scenes, dtype=torch.float64)
-    return weights.scatter_add_(1, drawn, torch.ones_like(weights))
+def _percentile_interval(
+    of_scenes: Callable[[NDArray[np.int64]], Counts],
+    num_scenes: int,
+    value: float,
+    num_resamples: int,
+    seed: int,
+) -> tuple[float, float]:
+    """Return the bounds of a number's values over drawn scenes, ``value`` itself where none can be drawn.
 
-
-def _percentiles(values: Tensor) -> tuple[float, float]:
-    tail = (1 - CONFIDENCE) / 2
-    low, high = torch.quantile(values, torch.tensor([tail, 1 - tail], dtype=torch.float64)).tolist()
-    return low, high
+    Args:
+        of_scenes: from the numbers of drawn scenes ``(..., S)`` to the number, ``(...,)``.
+        num_scenes: S.
+        value: the number of all scenes.
+        num_resamples: how often to draw.
+        seed: of the drawing.
+    """
+    if num_scenes < 2:
+        return value, value
+    result = bootstrap(
+        (np.arange(num_scenes),),
+        lambda scenes, axis: of_scenes(np.moveaxis(scenes, axis, -1)),
+        n_resamples=num_resamples,
+        batch=_BATCH,
+        vectorized=True,
+        confidence_level=CONFIDENCE,
+        method="percentile",
+        rng=np.random.default_rng(seed),
+    )
+    return float(result.confidence_interval.low), float(result.confidence_interval.high)

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from raytran.errors import ConfigError
-from raytran.metrics.functional.alignment import AlignmentErrors, alignment_errors
+from raytran.metrics.functional.alignment import SCAN2CAD_LIMITS, AlignmentErrors, alignment_errors
 from raytran.metrics.functional.cad_errors import cad_symmetries, equal_names
-from raytran.metrics.functional.matching import match_in_order, score_order
+from raytran.metrics.functional.detection import match_in_order, score_order
 from raytran.metrics.functional.scan2cad import match_scan2cad
 from raytran.metrics.functional.vid2cad import VID2CAD_CLASS_BY_CATID, match_vid2cad
-from raytran.metrics.records import ProtocolMetric, Row, SceneRecord
+from raytran.metrics.per_scene import ProtocolMetric, Row, SceneRecord
 from raytran.structs import CLASSES, CadAlignments, ObjectSet
 
 SCAN2CAD_PROTOCOLS: tuple[str, ...] = ("strict", "scan2cad", "vid2cad")
@@ -91,9 +91,9 @@ class Scan2CADAccuracy(ProtocolMetric):
         *,
         protocol: str = "strict",
         cad_symmetries: Mapping[str, int] | None = None,
-        max_translation: float = 0.2,
-        max_rotation: float = 20.0,
-        max_scale: float = 0.2,
+        max_translation: float = SCAN2CAD_LIMITS[0],
+        max_rotation: float = SCAN2CAD_LIMITS[1],
+        max_scale: float = SCAN2CAD_LIMITS[2],
         **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
@@ -159,13 +159,14 @@ class Scan2CADAccuracy(ProtocolMetric):
         return result
 
     def _counted(self, scenes: Sequence[SceneRecord]) -> Tensor:
-        """Return the objects of all scenes that count."""
-        truths = [torch.zeros(0, self.truth_columns), *(scene.truths for scene in scenes)]
+        """Return the rows of the objects that count."""
+        truths = self.truths()
         if self.protocol == "vid2cad":
-            seen = torch.cat([truths[0], *(scene.truths for scene in scenes if len(scene.predictions))])[:, 0]
-            truths = [part[torch.isin(part[:, 0], seen)] for part in truths]
-        counted = torch.cat(truths)
-        return counted[counted[:, 0] >= 0]
+            known = {
+                label for scene in scenes if len(scene.predictions) for label in scene.truths[:, 0].tolist()
+            }
+            truths = truths[torch.isin(truths[:, 0], torch.tensor(sorted(known), dtype=truths.dtype))]
+        return truths[truths[:, 0] >= 0]
 
     def _accuracy(self, n_good: int, n_total: int) -> float:
         accuracy = n_good / max(n_total, 1)

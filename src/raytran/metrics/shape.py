@@ -4,17 +4,16 @@
 from __future__ import annotations
 
 import math
-from typing import Any, TypedDict
+from typing import TypedDict
 
 import torch
 from torch import Tensor
 
 from raytran.errors import ShapeError
-from raytran.metrics.functional.alignment import alignment_errors
-from raytran.metrics.functional.matching import match_in_order, score_order
+from raytran.metrics.functional.alignment import SCAN2CAD_LIMITS, alignment_errors
+from raytran.metrics.functional.detection import match_in_order, score_order
 from raytran.metrics.functional.shape import chamfer_distance, grid_iou, surface_points
-from raytran.metrics.records import Row, SceneRecord, SceneRecordMetric
-from raytran.metrics.scan2cad import Scan2CADAccuracy
+from raytran.metrics.per_scene import ObjectMetric, Row, SceneRecord
 from raytran.structs import CLASSES, ObjectSet
 
 
@@ -38,7 +37,7 @@ class ShapeResult(ClassShapes):
     per_class: dict[str, ClassShapes]
 
 
-class MatchedShapeScores(SceneRecordMetric):
+class MatchedShapeScores(ObjectMetric):
     """Mean IoU and chamfer distance of the shapes of the objects that strict ``Scan2CADAccuracy`` finds.
 
     Both shapes are ``(S, S, S)`` grids over an object's own box; a cell is occupied where the predicted
@@ -56,10 +55,6 @@ class MatchedShapeScores(SceneRecordMetric):
     prediction_columns = 0
     judges_shapes = True
 
-    def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**kwargs)
-        self.limits = Scan2CADAccuracy().limits
-
     def judge(self, predictions: ObjectSet, targets: ObjectSet) -> tuple[Tensor, Tensor]:
         """Match one scene and compare the shapes of the pairs; see the base class.
 
@@ -72,7 +67,7 @@ class MatchedShapeScores(SceneRecordMetric):
         if not len(predictions) or not len(targets):
             return table, none
         predicted, true = _occupied(predictions, targets)
-        allowed = alignment_errors(predictions, targets).within(*self.limits)
+        allowed = alignment_errors(predictions, targets).within(*SCAN2CAD_LIMITS)
         allowed &= predictions.label[:, None] == targets.label
         for taker, taken in enumerate(match_in_order(score_order(predictions.score), allowed).tolist()):
             if taken >= 0:
@@ -83,8 +78,7 @@ class MatchedShapeScores(SceneRecordMetric):
 
     def compute(self) -> ShapeResult:
         """Return the means over all matched objects and over those of each class."""
-        empty = torch.zeros(0, self.truth_columns, dtype=torch.float64)
-        truths = torch.cat([empty, *(scene.truths for scene in self.scenes())])
+        truths = self.truths()
         matched = truths[truths[:, 1] == 1]
         per_class = {name: _means(matched[matched[:, 0] == k]) for k, name in enumerate(CLASSES)}
         n_empty = int(matched[:, 3].isnan().sum())

@@ -16,7 +16,7 @@ from urllib.parse import urlparse
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 
-from raytran.data.atomic import write_text
+from raytran.data.files import write_text
 from raytran.errors import ConfigError
 
 _log = logging.getLogger(__name__)

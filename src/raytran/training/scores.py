@@ -4,26 +4,19 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from functools import partial
 from typing import Any, Literal
 
 import torch
 from torch import nn
-from torchmetrics import Metric
 
-from raytran.metrics.atlas import ErrorAtlas
-from raytran.metrics.curves import AccuracyCurves
+from raytran.metrics.box_f1 import OrientedBoxF1
+from raytran.metrics.iou import ForegroundIoU, SceneOccupancyIoU
 from raytran.metrics.new_views import NewViewScores
-from raytran.metrics.odam import OrientedBoxF1
-from raytran.metrics.records import Row
-from raytran.metrics.scan2cad import Scan2CADAccuracy
-from raytran.metrics.scene import ForegroundIoU, SceneOccupancyIoU
+from raytran.metrics.per_scene import Row
 from raytran.metrics.shape import MatchedShapeScores
-from raytran.postprocess import select_objects
+from raytran.metrics.strict import StrictScores, side_by_side
+from raytran.postprocess import DUPLICATE_IOU, SCORE_THRESHOLD, select_objects
 from raytran.structs import ObjectSet, SceneBatch, ScenePrediction
-
-SCORE_THRESHOLD = 0.5
-DUPLICATE_IOU = 0.25
 
 _OF_ALL_SCORES = ("best", "average_precision", "mean_average_precision")
 """What only predictions of every score can tell."""
@@ -49,124 +42,111 @@ class SceneScores(nn.Module):
         volume_extent: Sequence[float] | None = None,
     ) -> None:
         super().__init__()
-        self._select = partial(select_objects, duplicate_iou=duplicate_iou)
         self._score_threshold = score_threshold
-        self.accuracy = Scan2CADAccuracy(protocol="strict") if "objects" in tasks else None
-        self.box_f1 = OrientedBoxF1(protocol="strict") if "objects" in tasks else None
-        # Sees predictions of every score, to tell which threshold would have been the best.
-        self.box_f1_sweep = OrientedBoxF1(protocol="strict") if "objects" in tasks else None
-        explain = "objects" in tasks and volume_extent is not None
-        self.curves = AccuracyCurves() if explain else None
-        self.atlas = ErrorAtlas(volume_extent=volume_extent) if explain else None
+        self._duplicate_iou = duplicate_iou
+        self.strict = self.box_f1_of_all = None
+        if "objects" in tasks:
+            self.strict = StrictScores(explain=volume_extent is not None, volume_extent=volume_extent)
+            # Predictions of every score, to tell which threshold would have been the best.
+            self.box_f1_of_all = OrientedBoxF1()
         self.shape = MatchedShapeScores() if "shape" in tasks else None
         self.occupancy = SceneOccupancyIoU() if "occupancy" in tasks else None
         self.foreground = ForegroundIoU() if "foreground" in tasks else None
-        self.view = NewViewScores() if "view" in tasks else None
+        self.new_views = NewViewScores() if "view" in tasks else None
 
     def update(self, batch: SceneBatch, predictions: Sequence[ScenePrediction]) -> None:
         """Add scenes; a metric whose targets the batch lacks is left as it is."""
-        if batch.objects is not None:
-            self._update_objects(batch, batch.objects, predictions)
+        if self.strict is not None and self.box_f1_of_all is not None and batch.objects is not None:
+            counted = self._objects(predictions, self._score_threshold)
+            self.strict.update(counted, batch.objects, batch.scene_id, list(batch.grid_center))
+            self.box_f1_of_all.update(self._objects(predictions, 0.0), batch.objects, batch.scene_id)
         for index, prediction in enumerate(predictions):
             names = [batch.scene_id[index]]
-            if (
-                self.occupancy is not None
-                and batch.occupancy is not None
-                and prediction.occupancy is not None
-            ):
-                self.occupancy.update(prediction.occupancy[None], batch.occupancy[index, None], names)
-            if (
-                self.foreground is not None
-                and batch.foreground is not None
-                and prediction.foreground is not None
-            ):
-                self.foreground.update(prediction.foreground[None], batch.foreground[index, None], names)
+            occupancy, foreground = prediction.occupancy, prediction.foreground
+            if self.occupancy is not None and batch.occupancy is not None and occupancy is not None:
+                self.occupancy.update(occupancy[None], batch.occupancy[index, None], names)
+            if self.foreground is not None and batch.foreground is not None and foreground is not None:
+                self.foreground.update(foreground[None], batch.foreground[index, None], names)
         rendered = [p.new_views for p in predictions if p.new_views is not None]
-        if self.view is not None and batch.new_views is not None and len(rendered) == len(predictions):
-            self.view.update(torch.stack(rendered), batch.new_views, batch.views, batch.scene_id)
-
-    def _update_objects(
-        self, batch: SceneBatch, targets: Sequence[ObjectSet], predictions: Sequence[ScenePrediction]
-    ) -> None:
-        if self.accuracy is None or self.box_f1 is None or self.box_f1_sweep is None:
-            return
-        kept = [self._select(p, score_threshold=self._score_threshold).objects for p in predictions]
-        self.accuracy.update(kept, targets, batch.scene_id)
-        self.box_f1.update(kept, targets, batch.scene_id)
-        if self.curves is not None and self.atlas is not None:
-            self.curves.update(kept, targets, batch.scene_id)
-            self.atlas.update(kept, targets, batch.scene_id, list(batch.grid_center))
-        every = [self._select(p, score_threshold=0.0).objects for p in predictions]
-        self.box_f1_sweep.update(every, targets, batch.scene_id)
+        if self.new_views is not None and batch.new_views is not None and len(rendered) == len(predictions):
+            self.new_views.update(torch.stack(rendered), batch.new_views, batch.views, batch.scene_id)
 
     def update_shapes(self, batch: SceneBatch, predictions: Sequence[ScenePrediction]) -> None:
-        """Add the shapes of scenes; apart from ``update``, since decoding them for every slot is dear.
+        """Add the shapes of scenes; apart from ``update``, since decoding them for every query is dear.
 
         Args:
             batch: scenes whose objects have shapes.
             predictions: with shapes for at least the objects that count as predicted.
         """
         if self.shape is not None and batch.objects is not None:
-            kept = [self._select(p, score_threshold=self._score_threshold).objects for p in predictions]
-            self.shape.update(kept, batch.objects, batch.scene_id)
+            counted = self._objects(predictions, self._score_threshold)
+            self.shape.update(counted, batch.objects, batch.scene_id)
+
+    def _objects(self, predictions: Sequence[ScenePrediction], score_threshold: float) -> list[ObjectSet]:
+        """Return the objects of each scene that count at a threshold."""
+        return [
+            select_objects(p, score_threshold=score_threshold, duplicate_iou=self._duplicate_iou).objects
+            for p in predictions
+        ]
 
     def results(self) -> dict[str, Any]:
-        """Return everything the metrics say, by metric, as plain Python; every rank must call it."""
-        found = {name: _plain(metric.compute()) for name, metric in self._metrics().items()}
-        sweep = found.pop("box_f1_sweep", {"per_threshold": {}})
-        for threshold, scores in sweep["per_threshold"].items():
-            found["box_f1"]["per_threshold"][threshold] |= {name: scores[name] for name in _OF_ALL_SCORES}
-        return found
+        """Return everything the metrics say in the layout of ``metrics.json``; every rank must call it."""
+        results: dict[str, Any] = {}
+        if self.strict is not None and self.box_f1_of_all is not None:
+            results["strict"] = self.strict.compute()
+            for threshold, scores in self.box_f1_of_all.compute()["per_threshold"].items():
+                of_threshold = results["strict"]["per_threshold"][threshold]
+                of_threshold |= {name: value for name, value in scores.items() if name in _OF_ALL_SCORES}
+        if self.occupancy is not None:
+            results["occupancy_iou"] = self.occupancy.compute().item()
+        if self.foreground is not None:
+            results["foreground_iou"] = self.foreground.compute().item()
+        if self.shape is not None:
+            results["shape"] = self.shape.compute()
+        if self.new_views is not None:
+            results["new_views"] = self.new_views.compute()
+        return results
 
     def compute(self) -> dict[str, float]:
         """Return the numbers to watch during training: ``task/number``, ``task/number/class``.
 
         Classes are those of the true objects.
         """
-        found = self.results()
+        results = self.results()
         numbers: dict[str, float] = {}
-        if "accuracy" in found:
-            numbers["objects/accuracy_global"] = found["accuracy"]["global_average"]
-            numbers["objects/accuracy_class"] = found["accuracy"]["class_average"]
-            for name, entry in found["accuracy"]["per_class"].items():
+        if "strict" in results:
+            strict = results["strict"]
+            numbers["objects/accuracy_global"] = strict["global_average"]
+            numbers["objects/accuracy_class"] = strict["class_average"]
+            for name, entry in strict["per_class"].items():
                 if entry["n_total"]:
                     numbers[f"objects/accuracy/{name}"] = entry["accuracy"]
-        for threshold, values in found.get("box_f1", {}).get("per_threshold", {}).items():
-            numbers[f"objects/f1_{threshold}"] = values["f1"]
-            for name, entry in values["per_class"].items():
-                if entry["n_true"]:
-                    numbers[f"objects/f1_{threshold}/{name}"] = entry["f1"]
+            for threshold, values in strict["per_threshold"].items():
+                numbers[f"objects/f1_{threshold}"] = values["f1"]
+                for name, entry in values["per_class"].items():
+                    if entry["n_true"]:
+                        numbers[f"objects/f1_{threshold}/{name}"] = entry["f1"]
         for task in ("occupancy", "foreground"):
-            if task in found:
-                numbers[f"{task}/iou"] = found[task]
-        for name in (name for name in found.get("view", {}) if name != "n_views"):
-            numbers[f"view/{name}"] = found["view"][name]
+            if f"{task}_iou" in results:
+                numbers[f"{task}/iou"] = results[f"{task}_iou"]
+        for name, value in results.get("new_views", {}).items():
+            if name != "n_views":
+                numbers[f"view/{name}"] = value
         return numbers
 
     def rows(self, per: Literal["scene", "object"]) -> list[Row]:
-        """Return a row per scene or true object, the columns of the object metrics side by side."""
-        if self.accuracy is None or self.box_f1 is None:
+        """Return a row for each scene or true object, the columns of the object metrics side by side."""
+        if self.strict is None:
             return []
-        tables = [
-            metric.rows(per)
-            for metric in (self.accuracy, self.box_f1, self.shape, self.atlas)
-            if metric is not None
-        ]
-        return [{k: v for row in rows for k, v in row.items()} for rows in zip(*tables, strict=True)]
+        return side_by_side(per, self.strict.accuracy, self.strict.box_f1, self.shape, self.strict.atlas)
+
+    def new_view_rows(self) -> list[Row]:
+        """Return a row for each new view."""
+        return [] if self.new_views is None else self.new_views.rows()
 
     def reset(self) -> None:
         """Forget all scenes."""
-        for metric in self._metrics().values():
-            metric.reset()
-
-    def _metrics(self) -> dict[str, Metric]:
-        return {name: metric for name, metric in self.named_children() if isinstance(metric, Metric)}
-
-
-def _plain(value: Any) -> Any:
-    """Return ``value`` with tensors turned into numbers."""
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_plain(item) for item in value]
-    return value.item() if hasattr(value, "item") else value
+        objects = (self.strict, self.box_f1_of_all, self.shape)
+        for metric in (*objects, self.occupancy, self.foreground, self.new_views):
+            if metric is not None:
+                metric.reset()

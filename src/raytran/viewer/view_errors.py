@@ -11,7 +11,7 @@ from torch import Tensor
 
 from raytran.geometry.boxes import OrientedBoxes, box_iou
 from raytran.metrics.functional.alignment import alignment_errors
-from raytran.metrics.functional.matching import match_in_order, score_order
+from raytran.metrics.functional.detection import match_in_order, score_order
 from raytran.structs import ObjectSet
 
 LIMITS = (0.2, 20.0, 0.2)

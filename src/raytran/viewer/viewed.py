@@ -11,7 +11,7 @@ from torch import Tensor
 from raytran.backbone.observed import ObservedAttention
 from raytran.data.scan2cad import read_annotations, scene_objects
 from raytran.errors import DataError
-from raytran.export.scene_json import FORMAT, read_scene_json
+from raytran.export import FORMAT, read_scene_json
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.model import RayTran

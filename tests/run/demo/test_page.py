@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from raytran.run.demo.page import ShownScene, headline, write_page
-from raytran.run.predict.files import PredictedScene, write_scene
+from raytran.run.predict.write_scene import PredictedScene, write_scene
 from raytran.run.train.fit import FitResult
 from raytran.structs import CLASSES, ObjectSet, SceneBatch, ScenePrediction, Views
 

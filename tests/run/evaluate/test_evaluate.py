@@ -14,7 +14,8 @@ from torch import nn
 
 from raytran.errors import ConfigError
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.run.evaluate.evaluate import TASKS_WITH_SHAPE, evaluate_model, metrics_table, with_at_most
+from raytran.run.evaluate.evaluate import TASKS_WITH_SHAPE, evaluate_model, with_at_most
+from raytran.run.evaluate.results import result_tables, write_evaluation
 from raytran.structs import ObjectSet, SceneBatch, ScenePrediction, Views
 
 
@@ -64,7 +65,10 @@ def test_shapes_of_found_objects_are_compared(tmp_path):
     half_right[1, :2] = 0.0
     model = Oracle(replace(truth, shape=half_right, score=torch.tensor([0.9, 0.8, 0.3])))
     output = tmp_path / "out"
-    metrics = evaluate_model(model, [batch], tasks=TASKS_WITH_SHAPE, output=output, progress=False)
+    evaluation = evaluate_model(model, [batch], tasks=TASKS_WITH_SHAPE, progress=False)
+    files = write_evaluation(output, evaluation)
+    assert {path.name for path in output.iterdir()} == set(files)
+    metrics = evaluation.metrics
     assert metrics["shape"]["n_matched"] == 2
     assert metrics["shape"]["iou"] == 0.75
     assert metrics["strict"]["n_good"] == 2
@@ -75,8 +79,10 @@ def test_shapes_of_found_objects_are_compared(tmp_path):
         rows = list(csv.DictReader(file))
     assert [row["shape_iou"] for row in rows] == ["1.0", "0.5", ""]
     assert [row["matched"] for row in rows] == ["True", "True", "False"]
+    atlas = json.loads((output / "atlas.json").read_text())
+    assert [(miss["object"], miss["cause"]) for miss in atlas["misses"]] == [(2, "missed")]
     console = Console(width=100, record=True)
-    console.print(metrics_table(metrics, title="t"))
+    console.print(*result_tables(evaluation, title="t"))
     assert "0.750" in console.export_text()
 
 
@@ -86,18 +92,19 @@ def test_nothing_found_is_told_too(tmp_path):
         replace(batch.objects[0], shape=batch.objects[0].shape.float(), score=torch.full((3,), 0.1))
     )
     output = tmp_path / "out"
-    metrics = evaluate_model(model, [batch], tasks=TASKS_WITH_SHAPE, output=output, progress=False)
+    evaluation = evaluate_model(model, [batch], tasks=TASKS_WITH_SHAPE, progress=False)
+    write_evaluation(output, evaluation)
+    metrics = evaluation.metrics
     assert metrics["shape"]["iou"] is None
     assert metrics["strict"]["global_average"] == 0
     assert "NaN" not in (output / "metrics.json").read_text()
-    Console(quiet=True).print(metrics_table(metrics, title="t"))
+    Console(quiet=True).print(*result_tables(evaluation, title="t"))
 
 
 def test_shapes_are_left_alone_unless_asked_for():
     batch = scene()
     model = Oracle(replace(batch.objects[0], shape=batch.objects[0].shape.float()))
-    metrics = evaluate_model(model, [batch], progress=False)
-    assert "shape" not in metrics
+    assert "shape" not in evaluate_model(model, [batch], progress=False).metrics
     assert model.thresholds == []
 
 

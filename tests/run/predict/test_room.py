@@ -18,7 +18,8 @@ from raytran.errors import DataError
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.run.predict import room as module
-from raytran.run.predict.room import predict_room, predict_volume, read_room
+from raytran.run.predict.predict import predict_room
+from raytran.run.predict.room import RoomViews, read_room
 from raytran.structs import ObjectSet, ScenePrediction, Views
 
 from ...factories import EXTENT as SMALL_EXTENT
@@ -176,7 +177,8 @@ def test_a_room_that_fits_is_predicted_as_ever(hall, caplog):
     assert room.frame_ids == frame_ids
     assert torch.equal(room.views.images, views.images)
     limits = {"scene_id": "hall", "score_threshold": 0.0, "duplicate_iou": None}
-    here, there = predict_room(model, room, **limits), predict_volume(model, views, **limits)
+    alone = RoomViews.in_one_volume(views, frame_ids, model)
+    here, there = predict_room(model, room, **limits), predict_room(model, alone, **limits)
     assert len(here.objects) == 5
     for name in ("center", "size", "score", "shape", "num_views"):
         assert torch.equal(getattr(here.objects, name), getattr(there.objects, name))
@@ -230,7 +232,7 @@ def test_blurred_frames_are_left_out_and_counted(hall, caplog):
 
 def test_of_a_long_video_some_frames_are_looked_at(hall, monkeypatch, caplog):
     caplog.set_level("INFO")
-    monkeypatch.setattr(module, "LOOKED_AT", 20)
+    monkeypatch.setattr(module, "MAX_CANDIDATES", 20)
     room = read(hall, num_views=50, extent=(20.0, 20.0, 3.5))
     assert room.frame_ids == tuple(str(1 + 3 * n) for n in range(20))
     assert "chose 20 of 20 frames" in caplog.text

@@ -12,6 +12,9 @@ from torch import Tensor
 from raytran.geometry.rotation import geodesic_angle
 from raytran.structs import SYMMETRY_INFINITE, ObjectSet
 
+SCAN2CAD_LIMITS = (0.2, 20.0, 0.2)
+"""Largest translation, rotation and scale error of an object that counts as found: metres, degrees, ratio."""
+
 
 class AlignmentErrors(NamedTuple):
     """Errors of every prediction against every true object, each ``(P, M)``.

@@ -12,7 +12,7 @@ from torch import Tensor
 from raytran.errors import ShapeError
 from raytran.metrics.functional.alignment import AlignmentErrors
 from raytran.metrics.functional.cad_errors import cad_errors, equal_names
-from raytran.metrics.functional.matching import match_in_order
+from raytran.metrics.functional.detection import match_in_order
 from raytran.structs import CLASS_BY_CATID, CadAlignments
 
 VID2CAD_CLASS_BY_CATID: dict[str, str] = {**CLASS_BY_CATID, "02818832": "bed"}

@@ -23,8 +23,10 @@ from raytran.run.demo.page import COLUMNS, ShownScene, headline, write_page
 from raytran.run.demo.steps import StepTimes
 from raytran.run.entry import compose
 from raytran.run.evaluate.evaluate import TASKS_WITH_SHAPE, about_data, evaluate_model
-from raytran.run.predict.files import write_scene
+from raytran.run.evaluate.results import write_evaluation
 from raytran.run.predict.predict import predict_scene
+from raytran.run.predict.room import RoomViews
+from raytran.run.predict.write_scene import write_scene
 from raytran.run.train.build import build_data, plain
 from raytran.run.train.curriculum import run_curriculum
 from raytran.run.train.fit import FitResult
@@ -155,23 +157,24 @@ def _asked(overrides: Sequence[str], data: SceneDataModule, checkpoint: Path) ->
 
 def _evaluate(cfg: DictConfig, asked: Asked, output: Path) -> dict[str, Any]:
     about = {"checkpoint": str(asked.checkpoint), **about_data(asked.data, asked.split, asked.num_views)}
-    return evaluate_model(
+    evaluation = evaluate_model(
         asked.model,
         asked.data.split(asked.split),
         tasks=TASKS_WITH_SHAPE,
-        output=output,
         score_threshold=cfg.score_threshold,
         duplicate_iou=cfg.duplicate_iou,
         about=about,
     )
+    write_evaluation(output, evaluation)
+    return evaluation.metrics
 
 
 def _predict_first(cfg: DictConfig, name: str, asked: Asked, output: Path) -> ShownScene:
     """Predict the first of the rooms; write what ``raytran.predict`` writes, the truth in the plan."""
     batch = asked.data.split(asked.split)[0]
-    found = predict_scene(
+    scene = predict_scene(
         asked.model,
-        batch.views,
+        RoomViews.in_one_volume(batch.views, batch.frame_id[0], asked.model),
         scene_id=batch.scene_id[0],
         score_threshold=cfg.score_threshold,
         duplicate_iou=cfg.duplicate_iou,
@@ -179,8 +182,8 @@ def _predict_first(cfg: DictConfig, name: str, asked: Asked, output: Path) -> Sh
     folder = output / "predictions" / (("shipped-" if name == "shipped" else "") + batch.scene_id[0])
     truth = None if batch.objects is None else batch.objects[0]
     extent = asked.model.grid_extent
-    write_scene(folder, found, batch.views, batch.frame_id[0], grid_extent=extent, truth=truth)
-    return ShownScene(name, folder, batch, found.prediction, extent)
+    write_scene(folder, scene, batch.views, batch.frame_id[0], grid_extent=extent, truth=truth)
+    return ShownScene(name, folder, batch, scene.prediction, extent)
 
 
 def _tell(page: Path, metrics: Mapping[str, Mapping[str, Any]], seconds: Mapping[str, float]) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good a model is on annotated scenes: numbers in all, by scene and by object."""
+"""How good a model is on annotated scenes, or how good anybody's predictions are."""
 
 from __future__ import annotations
 
@@ -14,32 +14,31 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 from torch.utils.data import Dataset, Subset
 
 from raytran.checkpoints.checkpoint import PredictionSettings, load_model, prediction_settings
 from raytran.checkpoints.network import trusted_packages
 from raytran.data.views import RepeatedFrames
 from raytran.errors import ConfigError
-from raytran.metrics.curves import accuracy_by_scene_size
+from raytran.geometry.camera import Cameras
 from raytran.model import RayTran
-from raytran.pictures.accuracy_curves import FILE as FIGURE
+from raytran.postprocess import DUPLICATE_IOU, SCORE_THRESHOLD
 from raytran.run.device import choose_device, set_matmul_precision
 from raytran.run.entry import compose
-from raytran.run.evaluate.figure import Curves, draw_figure, read_curves
-from raytran.run.evaluate.score import score, write_csv
-from raytran.run.evaluate.views import FILES, evaluate_views, views_table
-from raytran.run.output import check_replaceable, replaced_folder
+from raytran.run.evaluate.results import MARKER, Evaluation, read_curves, result_tables, write_evaluation
+from raytran.run.evaluate.score import ProtocolScores, confidence, evaluate_predictions
+from raytran.run.output import check_replaceable
 from raytran.run.train.build import build_data
 from raytran.structs import SceneBatch
 from raytran.training.datamodule import SceneDataModule
-from raytran.training.scores import DUPLICATE_IOU, SCORE_THRESHOLD, SceneScores
+from raytran.training.scores import SceneScores
 
 _log = logging.getLogger(__name__)
 
-MARKER = "metrics.json"
 TASKS = ("objects", "occupancy", "foreground")
 TASKS_WITH_SHAPE = (*TASKS, "shape")
+TASKS_OF_STAGE = {"stage3": TASKS_WITH_SHAPE, "novel_view": ("view",)}
+"""What checkpoints of a stage are asked for, if not for ``TASKS``: the others leave shapes untrained."""
 
 
 def evaluate(cfg: DictConfig) -> dict[str, Any]:
@@ -50,89 +49,100 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
 
     Raises:
         CheckpointError: the checkpoint is missing or damaged.
-        DataError: the data are missing or damaged.
-        ConfigError: ``output`` holds something that is no earlier result.
+        DataError: the data or the predictions are missing or damaged.
+        ConfigError: a setting is missing or does not go with the others, or ``output`` holds something that
+            is no earlier result.
     """
     if (cfg.checkpoint is None) == (cfg.predictions is None):
         raise ConfigError("give either checkpoint=CKPT or predictions=DIR annotations=FILE, not both")
-    beside = read_curves(cfg.draw_with)
-    if cfg.predictions is not None:
-        return score(cfg, beside)
+    if cfg.num_resamples < 1:
+        raise ConfigError(f"num_resamples={cfg.num_resamples} is too few, give at least 1")
+    other_curves = read_curves(cfg.draw_with)
     output = Path(cfg.output)
     check_replaceable(output.resolve(), marker=MARKER)
+    evaluation, title = _of_files(cfg) if cfg.checkpoint is None else _of_checkpoint(cfg)
+    files = write_evaluation(output, evaluation, other_curves=other_curves)
+    console = Console()
+    for table in result_tables(evaluation, title=title):
+        console.print(table)
+    _log.info("wrote %s: %s", output.resolve(), ", ".join(files))
+    return evaluation.metrics
+
+
+def _of_files(cfg: DictConfig) -> tuple[Evaluation, str]:
+    """Return the scores of ``predictions=`` and what was measured."""
+    if cfg.annotations is None:
+        raise ConfigError("predictions= needs annotations=FILE, Scan2CAD's full_annotations.json")
+    paths = {name: None if cfg[name] is None else Path(cfg[name]) for name in ("compare", "split", "scans")}
+    evaluation = evaluate_predictions(
+        Path(cfg.predictions),
+        Path(cfg.annotations),
+        cfg.protocol,
+        compare_with=paths["compare"],
+        split=paths["split"],
+        scans=paths["scans"],
+        volume_extent=list(cfg.volume_extent),
+        num_resamples=cfg.num_resamples,
+        seed=cfg.seed,
+    )
+    return evaluation, str(cfg.predictions)
+
+
+def _of_checkpoint(cfg: DictConfig) -> tuple[Evaluation, str]:
+    """Return the scores of ``checkpoint=`` and what was measured."""
     settings = prediction_settings(cfg.checkpoint)
-    model = _network(cfg)
-    cfg = _in_its_preset(cfg, settings)
-    # The stages before it leave the shape head untrained.
-    tasks = TASKS_WITH_SHAPE if settings.stage == "stage3" else TASKS
-    _make_data_fit(cfg, settings, model, tasks)
+    device = choose_device(cfg.device)
+    set_matmul_precision(cfg.matmul_precision, device)
+    model = load_model(cfg.checkpoint, attention=cfg.attention, trust=trusted_packages(cfg.trust)).to(device)
+    tasks = TASKS_OF_STAGE.get(settings.stage, TASKS)
+    # The checkpoint says of which preset it is and which data it wants: composed again with that.
+    cfg = compose("evaluate", _overrides_of_checkpoint(cfg, settings, model, tasks))
+    split = cfg.split or "val"
     data = build_data(cfg)
     data.prepare_data()
-    scenes = with_at_most(cfg.max_objects, data.split(cfg.split))
-    title = f"{cfg.split} scenes of {data.root}, {cfg.views.num_views} frames each"
-    about = about_data(data, cfg.split, cfg.views.num_views) | {
-        "checkpoint": str(cfg.checkpoint),
-        "max_objects": cfg.max_objects,
-    }
-    if settings.stage == "novel_view":
-        metrics = evaluate_views(model, scenes, output=output, views_at_once=cfg.views_at_once, about=about)
-        Console().print(views_table(metrics, title=f"{settings.preset}, {title}"))
-        _log.info("wrote %s: %s", output.resolve(), ", ".join(FILES))
-        return metrics
-    metrics = evaluate_model(
+    evaluation = evaluate_model(
         model,
-        scenes,
+        with_at_most(cfg.max_objects, data.split(split)),
         tasks=tasks,
-        output=output,
         score_threshold=cfg.score_threshold,
         duplicate_iou=cfg.duplicate_iou,
         views_at_once=cfg.views_at_once,
-        about=about,
-        beside=beside,
+        num_resamples=cfg.num_resamples,
+        seed=cfg.seed,
+        about=about_data(data, split, cfg.views.num_views)
+        | {"checkpoint": str(cfg.checkpoint), "max_objects": cfg.max_objects},
     )
-    Console().print(metrics_table(metrics, title=f"{settings.preset}, {title}"))
-    _log.info("wrote %s: metrics.json, per_scene.csv, per_object.csv, %s", output.resolve(), FIGURE)
-    return metrics
+    return evaluation, f"{settings.preset}, {split} scenes of {data.root}, {cfg.views.num_views} frames each"
+
+
+def _overrides_of_checkpoint(
+    cfg: DictConfig, settings: PredictionSettings, model: RayTran, tasks: Collection[str]
+) -> list[str]:
+    """Return what was typed and, as if typed too, the preset and the data that a checkpoint wants."""
+    typed = list(HydraConfig.get().overrides.task)
+    preset = [] if any(item.startswith("preset=") for item in typed) else [f"preset={settings.preset}"]
+    wanted: dict[str, Any] = {
+        "views.image_size": list(settings.image_size),
+        "views.num_views": cfg.num_views or settings.num_views,
+        "model.grid_resolution": list(model.grid_resolution),
+        "model.grid_extent": list(model.grid_extent),
+        "data.dataset.input_mask": None,
+    }
+    if "view" in tasks:
+        wanted["stage.targets"] = []
+    else:
+        wanted["stage.new_views"] = 0
+    if "shape" in tasks:
+        wanted["stage.targets"] = [*cfg.stage.targets, "shapes"]
+    if model.backbone.encoder.input_channels == 4:
+        # Trained with true masks as a fourth channel, it gets the same here, unless others are typed.
+        wanted["data.dataset.input_mask"] = cfg.data.dataset.input_mask or settings.input_mask or "amodal"
+    return [*typed, *preset, *(f"{key}={json.dumps(value)}" for key, value in wanted.items())]
 
 
 def about_data(data: SceneDataModule, split: str, num_views: int) -> dict[str, Any]:
     """Return what ``metrics.json`` says of the scenes: data set, folder, split, and frames that went in."""
     return {"dataset": data.name, "data": str(data.root), "split": split, "num_views": num_views}
-
-
-def _network(cfg: DictConfig) -> RayTran:
-    """Return the network of the checkpoint on its device."""
-    device = choose_device(cfg.device)
-    set_matmul_precision(cfg.matmul_precision, device)
-    model = load_model(cfg.checkpoint, attention=cfg.attention, trust=trusted_packages(cfg.trust))
-    return model.to(device)
-
-
-def _in_its_preset(cfg: DictConfig, settings: PredictionSettings) -> DictConfig:
-    """Return the config in the checkpoint's preset, unless another was typed."""
-    overrides = list(HydraConfig.get().overrides.task)
-    if not any(item.startswith("preset=") for item in overrides):
-        cfg = compose("evaluate", [*overrides, f"preset={settings.preset}"])
-    cfg.split = cfg.split or "val"
-    return cfg
-
-
-def _make_data_fit(
-    cfg: DictConfig, settings: PredictionSettings, model: RayTran, tasks: Collection[str]
-) -> None:
-    """Ask for the data that a model wants: the checkpoint, not the preset, says which it was made for."""
-    cfg.views.image_size = list(settings.image_size)
-    cfg.views.num_views = cfg.num_views or settings.num_views
-    if "shape" in tasks:
-        cfg.stage.targets = [*cfg.stage.targets, "shapes"]
-    if settings.stage == "novel_view":
-        cfg.stage.targets = []
-    else:
-        cfg.stage.new_views = 0
-    cfg.model.grid_resolution, cfg.model.grid_extent = list(model.grid_resolution), list(model.grid_extent)
-    # One that was trained with true masks as a fourth channel gets the same here, unless another is typed.
-    mask = cfg.data.dataset.input_mask or settings.input_mask or "amodal"
-    cfg.data.dataset.input_mask = mask if model.backbone.encoder.input_channels == 4 else None
 
 
 def with_at_most(max_objects: int | None, dataset: Any) -> Dataset[SceneBatch]:
@@ -154,39 +164,40 @@ def with_at_most(max_objects: int | None, dataset: Any) -> Dataset[SceneBatch]:
     return Subset(dataset, chosen)
 
 
+@torch.no_grad()
 def evaluate_model(
     model: RayTran,
     dataset: Dataset[SceneBatch],
     *,
     tasks: Collection[str] = TASKS,
-    output: Path | None = None,
     score_threshold: float = SCORE_THRESHOLD,
     duplicate_iou: float | None = DUPLICATE_IOU,
     views_at_once: int | None = None,
+    num_resamples: int = 2000,
+    seed: int = 0,
     about: Mapping[str, Any] | None = None,
-    beside: Mapping[str, Curves] | None = None,
     progress: bool = True,
-) -> dict[str, Any]:
+) -> Evaluation:
     """Predict every scene of a data set and compare with its annotation.
 
     Args:
         model: the network, on any device; put in evaluation mode.
         dataset: scenes with targets, each a ``SceneBatch`` with B = 1.
-        tasks: what to compare: ``TASKS``, or with the shapes of the objects found ``TASKS_WITH_SHAPE``, for
-            which the scenes must have shapes.
-        output: folder for ``metrics.json``, ``per_scene.csv``, ``per_object.csv`` and
-            ``accuracy_curves.png``, which appear together or not at all; None writes nothing.
+        tasks: what to compare: ``TASKS``; with the shapes of the objects found ``TASKS_WITH_SHAPE``, for
+            which the scenes must have shapes; or ``view`` alone, for which they must have ``new_views``.
         score_threshold: objects with a lower score do not count as predicted.
         duplicate_iou: nor does one that overlaps a surer one of its class by more than this IoU.
-        views_at_once: views that pass through the network together, None for all.
+        views_at_once: frames that pass through the network together, None for all.
+        num_resamples: draws of the bootstrap.
+        seed: of the bootstrap.
         about: what to say beside the numbers, e.g. the checkpoint.
-        beside: accuracy curves of other results for the figure, by name.
         progress: show a progress bar.
 
     Returns:
-        per protocol (``strict``) what ``Scan2CADAccuracy`` and ``OrientedBoxF1`` return, with the accuracy
-        ``by_scene_size``, the ``curves`` and the error ``atlas``; ``occupancy_iou``, ``foreground_iou``,
-        under ``shape`` what ``MatchedShapeScores`` returns, and what ``about`` says.
+        per protocol (``strict``) what ``Scan2CADAccuracy`` and ``OrientedBoxF1`` return, with ``confidence``
+        intervals, the accuracy ``by_scene_size``, the ``curves`` and the error ``atlas``; ``occupancy_iou``,
+        ``foreground_iou``, under ``shape`` what ``MatchedShapeScores`` returns, under ``new_views`` what
+        ``NewViewScores`` does, and what ``about`` says.
     """
     device = next(model.parameters()).device
     scores = SceneScores(
@@ -196,70 +207,31 @@ def evaluate_model(
         volume_extent=model.grid_extent,
     ).to(device)
     model.eval()
+    forward_tasks = [task for task in tasks if task != "shape"]  # shapes are decoded of chosen objects alone
     repeated = RepeatedFrames()
     for index in track(range(len(dataset)), "evaluating", disable=not progress, transient=True):  # type: ignore[arg-type]
-        batch = dataset[index]
+        batch = dataset[index].to(device)
         repeated.look(batch)
-        _predict_and_compare(model, batch.to(device), scores, score_threshold, views_at_once)
-    settings = {"score_threshold": score_threshold, "duplicate_iou": duplicate_iou}
-    metrics = {**(about or {}), **settings, **_by_protocol(scores)}
-    if output is not None:
-        with replaced_folder(output, marker=MARKER) as folder:
-            (folder / MARKER).write_text(json.dumps(metrics, indent=2) + "\n")
-            write_csv(folder / "per_scene.csv", scores.rows("scene"))
-            write_csv(folder / "per_object.csv", scores.rows("object"))
-            draw_figure(folder, output.name, metrics["strict"]["curves"], beside or {})
-    return metrics
-
-
-@torch.no_grad()
-def _predict_and_compare(
-    model: RayTran,
-    batch: SceneBatch,
-    scores: SceneScores,
-    score_threshold: float,
-    views_at_once: int | None,
-) -> None:
-    raw = model(batch.views, tasks=TASKS, grid_center=batch.grid_center, views_at_once=views_at_once)
-    scores.update(batch, model.decode(raw, batch.scene_id, with_shapes=False))
-    if scores.shape is not None:
-        scores.update_shapes(batch, model.decode(raw, batch.scene_id, score_threshold=score_threshold))
-
-
-def _by_protocol(scores: SceneScores) -> dict[str, Any]:
-    """Return what all metrics say in the layout of ``metrics.json``."""
-    found = scores.results()
-    strict = found["accuracy"] | {"per_threshold": found["box_f1"]["per_threshold"]}
-    strict["by_scene_size"] = accuracy_by_scene_size(scores.rows("object"))
-    strict |= {"curves": found["curves"], "atlas": found["atlas"]}
-    metrics: dict[str, Any] = {"strict": strict}
-    metrics |= {f"{task}_iou": found[task] for task in ("occupancy", "foreground") if task in found}
-    return metrics | ({"shape": found["shape"]} if "shape" in found else {})
-
-
-def metrics_table(metrics: Mapping[str, Any], *, title: str) -> Table:
-    """Return the numbers as a table for the terminal."""
-    table = Table("class", "found", "objects", "accuracy", title=title)
-    accuracy = metrics["strict"]
-    for name, entry in accuracy["per_class"].items():
-        if entry["n_total"]:
-            table.add_row(name, str(entry["n_good"]), str(entry["n_total"]), f"{entry['accuracy']:.1%}")
-    table.add_section()
-    table.add_row("mean of classes", "", "", f"{accuracy['class_average']:.1%}")
-    table.add_row(
-        "all objects", str(accuracy["n_good"]), str(accuracy["n_total"]), f"{accuracy['global_average']:.1%}"
-    )
-    table.add_section()
-    for threshold, entry in metrics["strict"]["per_threshold"].items():
-        table.add_row(
-            f"F1 at IoU {threshold}", str(entry["n_matched"]), str(entry["n_true"]), f"{entry['f1']:.3f}"
+        new = {} if batch.new_views is None else {"new_cameras": Cameras.of(batch.new_views)}
+        raw = model(
+            batch.views,
+            tasks=forward_tasks,
+            grid_center=batch.grid_center,
+            views_at_once=views_at_once,
+            **new,
         )
-    for task in ("occupancy", "foreground"):
-        if f"{task}_iou" in metrics:
-            table.add_row(f"IoU of {task}", "", "", f"{metrics[f'{task}_iou']:.3f}")
-    if metrics.get("shape", {}).get("n_matched"):
-        shape, iou = metrics["shape"], f"{metrics['shape']['iou']:.3f}"
-        table.add_row("IoU of found objects' shapes", str(shape["n_matched"]), "", iou)
-        if shape["chamfer_distance"] is not None:
-            table.add_row("chamfer distance of these", "", "", f"{100 * shape['chamfer_distance']:.1f} cm")
-    return table
+        scores.update(batch, model.decode(raw, batch.scene_id, with_shapes=False))
+        if "shape" in tasks:
+            counted = model.decode(raw, batch.scene_id, score_threshold=score_threshold)
+            scores.update_shapes(batch, counted)
+    results = scores.results()
+    if "strict" not in results:
+        return Evaluation({**(about or {}), **results}, {"per_view.csv": scores.new_view_rows()})
+    strict = ProtocolScores(results["strict"], scores.rows("object"), scores.rows("scene"))
+    strict.metrics["confidence"] = confidence(strict, num_resamples=num_resamples, seed=seed)
+    settings = {"score_threshold": score_threshold, "duplicate_iou": duplicate_iou}
+    return Evaluation(
+        {**(about or {}), **settings, **results},
+        tables={"per_scene.csv": strict.scenes, "per_object.csv": strict.objects},
+        misses=strict.misses(),
+    )

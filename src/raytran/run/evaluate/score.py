@@ -1,86 +1,77 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good anybody's predictions are: files against annotations, without a model."""
+"""The scores of predictions from files under each protocol; intervals and comparisons over scenes."""
 
 from __future__ import annotations
 
-import csv
-import json
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
-from rich.console import Console
+import numpy as np
+from torch import Tensor
 
-from raytran.errors import ConfigError
-from raytran.metrics.records import Row
-from raytran.pictures.accuracy_curves import FILE as FIGURE
-from raytran.run.evaluate.figure import Curves, draw_figure
-from raytran.run.evaluate.files import PredictionFiles, read_predictions
-from raytran.run.evaluate.protocols import (
-    ProtocolScores,
-    Truth,
-    choose_protocols,
-    compare,
-    confidence,
-    read_truth,
-    score_protocol,
+from raytran.data.scan2cad import SceneAnnotation, read_annotations, scene_alignments, scene_objects
+from raytran.data.scannet.scan import read_scan
+from raytran.errors import ConfigError, DataError
+from raytran.export.read import CadBoxes, PredictionFiles, read_predictions
+from raytran.metrics.bootstrap import (
+    Comparison,
+    Counts,
+    Interval,
+    Statistic,
+    bootstrap_interval,
+    class_average,
+    class_counts,
+    compare_paired,
+    f1,
+    global_average,
 )
-from raytran.run.evaluate.table import atlas_table, comparison_table, scores_table
-from raytran.run.output import check_replaceable, replaced_folder
+from raytran.metrics.box_f1 import OrientedBoxF1
+from raytran.metrics.functional.cad_errors import cad_symmetries
+from raytran.metrics.per_scene import Row
+from raytran.metrics.scan2cad import Scan2CADAccuracy
+from raytran.metrics.strict import StrictScores, side_by_side
+from raytran.run.evaluate.results import PROTOCOLS, Evaluation
+from raytran.structs import CadAlignments, ObjectSet
 
 _log = logging.getLogger(__name__)
 
-MARKER = "metrics.json"
+ALL_PROTOCOLS = "all"
+_NEEDS_CADS = ("scan2cad", "vid2cad")
 
 
-def score(cfg: DictConfig, beside: Mapping[str, Curves]) -> dict[str, Any]:
-    """Run ``python -m raytran.evaluate predictions=DIR annotations=FILE``; see ``conf/evaluate.yaml``.
+@dataclass(frozen=True)
+class ProtocolScores:
+    """What one protocol says of one set of predictions.
 
-    Args:
-        cfg: the config of ``evaluate``.
-        beside: accuracy curves of other results for the figure, by name.
-
-    Returns:
-        The content of ``metrics.json``.
-
-    Raises:
-        ConfigError: a setting is missing or does not go with the predictions.
-        DataError: a file is missing or damaged.
+    Attributes:
+        metrics: the part of ``metrics.json`` under the protocol's name.
+        objects: a row for each annotated object that counts.
+        scenes: a row for each scene that counts.
     """
-    if cfg.annotations is None:
-        raise ConfigError("predictions= needs annotations=FILE, Scan2CAD's full_annotations.json")
-    if cfg.num_resamples < 1:
-        raise ConfigError(f"num_resamples={cfg.num_resamples} is too few, give at least 1")
 
-    def path(name: str) -> Path | None:
-        return None if cfg[name] is None else Path(cfg[name])
+    metrics: dict[str, Any]
+    objects: list[Row]
+    scenes: list[Row]
 
-    metrics = score_predictions(
-        Path(cfg.predictions),
-        Path(cfg.annotations),
-        cfg.protocol,
-        compare_with=path("compare"),
-        split=path("split"),
-        scans=path("scans"),
-        volume_extent=list(cfg.volume_extent),
-        output=Path(cfg.output),
-        num_resamples=cfg.num_resamples,
-        seed=cfg.seed,
-        beside=beside,
-    )
-    console = Console()
-    console.print(scores_table(metrics, title=str(cfg.predictions)))
-    if "strict" in metrics:
-        console.print(atlas_table(metrics["strict"]["atlas"]))
-    if "comparison" in metrics:
-        console.print(comparison_table(metrics["comparison"], str(cfg.predictions), str(cfg.compare)))
-    _log.info("wrote %s: %s", Path(cfg.output).resolve(), ", ".join(_written(metrics)))
-    return metrics
+    def misses(self) -> list[Row]:
+        """Return the rows of the objects that protocol ``strict`` counts as missed."""
+        return [row for row in self.objects if row["cause"] != "found"]
 
 
-def score_predictions(
+@dataclass(frozen=True)
+class Truth:
+    """The annotated scenes that are asked for, in the forms that the protocols compare."""
+
+    objects: dict[str, ObjectSet]
+    alignments: dict[str, CadAlignments]
+    cad_boxes: CadBoxes
+    volume_center: dict[str, Tensor]
+
+
+def evaluate_predictions(
     predictions: Path,
     annotations: Path,
     protocol: str = "strict",
@@ -89,11 +80,9 @@ def score_predictions(
     split: Path | None = None,
     scans: Path | None = None,
     volume_extent: Sequence[float] | None = None,
-    output: Path | None = None,
     num_resamples: int = 2000,
     seed: int = 0,
-    beside: Mapping[str, Curves] | None = None,
-) -> dict[str, Any]:
+) -> Evaluation:
     """Score the predictions for many scenes.
 
     Args:
@@ -104,85 +93,224 @@ def score_predictions(
         split: text file of the scenes that were asked for; None: all annotated ones.
         scans: ScanNet's ``scans`` folder, whose cameras tell where the voxel grid was.
         volume_extent: size of that grid, metres.
-        output: folder for the results, which appear together or not at all, or None.
         num_resamples: draws of the bootstrap.
         seed: of the bootstrap.
-        beside: accuracy curves of other results for the figure, by name; those of ``compare_with`` are there
-            in any case.
 
     Returns:
         by protocol what its metric returns and ``confidence`` intervals; ``comparison`` by protocol.
 
     Raises:
-        ConfigError: the protocol is unknown or does not fit the predictions, or ``output`` is in use.
+        ConfigError: the protocol is unknown or does not fit the predictions.
         DataError: a file is missing or damaged.
     """
-    if output is not None:
-        check_replaceable(output.resolve(), marker=MARKER)
     truth = read_truth(annotations, split=split, scans=scans)
-    files, scores = _by_protocol(protocol, predictions, truth, volume_extent)
-    about = {"predictions": predictions, "annotations": annotations, "split": split}
-    metrics: dict[str, Any] = {name: None if path is None else str(path) for name, path in about.items()}
+    files, scores = _scores_by_protocol(protocol, predictions, truth, volume_extent)
+    paths = {"predictions": predictions, "annotations": annotations, "split": split}
+    metrics: dict[str, Any] = {name: None if path is None else str(path) for name, path in paths.items()}
     metrics |= files.counts()
-    drawn = dict(beside or {})
-    chance = {"num_resamples": num_resamples, "seed": seed}
-    for name, part in scores.items():
-        metrics[name] = part.metrics | {"confidence": confidence(part, **chance)}
+    for name, of_protocol in scores.items():
+        intervals = confidence(of_protocol, num_resamples=num_resamples, seed=seed)
+        metrics[name] = of_protocol.metrics | {"confidence": intervals}
+    compared_curves = None
     if compare_with is not None:
-        others = _by_protocol(protocol, compare_with, truth)[1]
+        _, others = _scores_by_protocol(protocol, compare_with, truth)
         metrics["comparison"] = {
-            name: compare(part, others[name], **chance) for name, part in scores.items() if name in others
+            name: compare(scores[name], others[name], num_resamples=num_resamples, seed=seed)
+            for name in scores
+            if name in others
         }
-        if "strict" in others:
-            drawn = {str(compare_with): others["strict"].metrics["curves"], **drawn}
-    if output is not None:
-        _write(output, metrics, scores, drawn)
-    return metrics
+        compared_curves = others["strict"].metrics["curves"] if "strict" in others else None
+    return Evaluation(
+        metrics,
+        tables={
+            "per_object.csv": [{"protocol": name, **row} for name in scores for row in scores[name].objects],
+            "per_scene.csv": [{"protocol": name, **row} for name in scores for row in scores[name].scenes],
+        },
+        misses=scores["strict"].misses() if "strict" in scores else None,
+        compared_with=None if compare_with is None else str(compare_with),
+        compared_curves=compared_curves,
+    )
 
 
-def _by_protocol(
+def _scores_by_protocol(
     protocol: str, path: Path, truth: Truth, volume_extent: Sequence[float] | None = None
 ) -> tuple[PredictionFiles, dict[str, ProtocolScores]]:
     files = read_predictions(path, truth.objects, truth.cad_boxes)
+    protocols = choose_protocols(protocol, files, path)
     return files, {
-        name: score_protocol(name, files, truth, volume_extent=volume_extent)
-        for name in choose_protocols(protocol, files, path)
+        name: score_protocol(name, files, truth, volume_extent=volume_extent) for name in protocols
     }
 
 
-def _write(
-    output: Path,
-    metrics: Mapping[str, Any],
-    scores: Mapping[str, ProtocolScores],
-    beside: Mapping[str, Curves],
-) -> None:
-    tables: dict[str, list[Row]] = {
-        "per_object.csv": [
-            {"protocol": name, **row} for name, part in scores.items() for row in part.objects
-        ],
-        "per_scene.csv": [{"protocol": name, **row} for name, part in scores.items() for row in part.scenes],
+def read_truth(annotations: Path, *, split: Path | None = None, scans: Path | None = None) -> Truth:
+    """Read the annotated scenes.
+
+    Args:
+        annotations: Scan2CAD's ``full_annotations.json``.
+        split: text file of scene names, one a line; None: all scenes of the annotations.
+        scans: folder of ScanNet scans, whose cameras tell where each voxel grid was; None: unknown.
+
+    Raises:
+        DataError: a file is missing or damaged, or no scene of the split is annotated.
+    """
+    scenes = read_annotations(annotations)
+    chosen = _of_split(scenes, split, annotations)
+    centers = {} if scans is None else {name: _volume_center(scans / name) for name in chosen}
+    return Truth(
+        objects={name: scene_objects(scene) for name, scene in chosen.items()},
+        alignments={name: scene_alignments(scene) for name, scene in chosen.items()},
+        cad_boxes={
+            name: (center, half)
+            for scene in scenes.values()
+            for name, center, half in zip(scene.model_id, scene.box_center, scene.box_half_size, strict=True)
+        },
+        volume_center=centers,
+    )
+
+
+def _of_split(
+    scenes: Mapping[str, SceneAnnotation], split: Path | None, annotations: Path
+) -> dict[str, SceneAnnotation]:
+    if split is None:
+        return dict(scenes)
+    try:
+        names = split.read_text(encoding="utf-8").split()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"cannot read the scene names split={split} ({error}): check the path") from error
+    chosen = {name: scene for name, scene in scenes.items() if name in set(names)}
+    if not chosen:
+        raise DataError(f"none of the {len(names)} scenes that {split} names is annotated in {annotations}")
+    return chosen
+
+
+def _volume_center(scan: Path) -> Tensor:
+    """Return the mean camera position, on which the voxel grid of a scan is centred."""
+    return read_scan(scan).world_from_camera[:, :3, 3].mean(dim=0)
+
+
+def choose_protocols(protocol: str, files: PredictionFiles, path: Path) -> tuple[str, ...]:
+    """Return the protocols to follow.
+
+    Raises:
+        ConfigError: the protocol is unknown, or compares CAD models, which the predictions do not name.
+    """
+    if protocol not in (*PROTOCOLS, ALL_PROTOCOLS):
+        known = ", ".join((*PROTOCOLS, ALL_PROTOCOLS))
+        raise ConfigError(f"unknown protocol={protocol}, choose one of: {known}")
+    without = [scene.path for scene in files.scenes.values() if scene.cads is None]
+    possible = tuple(name for name in PROTOCOLS if not (without and name in _NEEDS_CADS))
+    if protocol == ALL_PROTOCOLS:
+        if without:
+            _log.warning("%s has objects without CAD models: only %s apply", without[0], ", ".join(possible))
+        return possible
+    if protocol not in possible:
+        raise ConfigError(
+            f"protocol={protocol} compares CAD models, and {without[0]} has objects without catid_cad and "
+            f"id_cad: choose one of {', '.join(possible)}"
+        )
+    return (protocol,)
+
+
+def score_protocol(
+    protocol: str, files: PredictionFiles, truth: Truth, *, volume_extent: Sequence[float] | None = None
+) -> ProtocolScores:
+    """Score predictions under one protocol.
+
+    Under ``strict`` and ``vid2cad`` scenes without a file count as scenes in which nothing was found; under
+    ``scan2cad`` and ``odam`` they do not count at all, as in the official scripts.
+    """
+    if protocol == "strict":
+        return _score_strict(files, truth, volume_extent)
+    if protocol == "odam":
+        names = [name for name in truth.alignments if name in files.scenes]
+        boxes = [files.scenes[name].boxes for name in names]
+        half_extents = {name: half.tolist() for name, (_, half) in truth.cad_boxes.items()}
+        metric: OrientedBoxF1 | Scan2CADAccuracy = OrientedBoxF1(
+            protocol="odam", cad_half_extents=half_extents
+        )
+    else:
+        names = [name for name in truth.alignments if name in files.scenes or protocol == "vid2cad"]
+        predicted = {name: scene.cads for name, scene in files.scenes.items()}
+        boxes = [predicted.get(name) or CadAlignments.empty() for name in names]
+        symmetries = cad_symmetries(truth.alignments[name] for name in names)
+        metric = Scan2CADAccuracy(protocol=protocol, cad_symmetries=symmetries)
+    metric.update(boxes, [truth.alignments[name] for name in names], names)
+    return ProtocolScores(dict(metric.compute()), metric.rows("object"), metric.rows("scene"))
+
+
+def _score_strict(
+    files: PredictionFiles, truth: Truth, volume_extent: Sequence[float] | None
+) -> ProtocolScores:
+    names, targets = list(truth.objects), list(truth.objects.values())
+    num_missing = sum(name not in files.scenes for name in names)
+    if num_missing:
+        _log.warning(
+            "%d of %d scenes have no predictions, and count as scenes in which nothing was found; name the "
+            "scenes that were asked for with split=FILE",
+            *(num_missing, len(names)),
+        )
+    predicted = {name: scene.objects for name, scene in files.scenes.items()}
+    predictions = [predicted.get(name, ObjectSet.empty()) for name in names]
+    scores = StrictScores(volume_extent=volume_extent)
+    scores.update(predictions, targets, names, [truth.volume_center.get(name) for name in names])
+    return ProtocolScores(
+        scores.compute(),
+        side_by_side("object", scores.accuracy, scores.box_f1, scores.atlas),
+        side_by_side("scene", scores.accuracy, scores.box_f1),
+    )
+
+
+def confidence(scores: ProtocolScores, *, num_resamples: int, seed: int) -> dict[str, Interval]:
+    """Return the 95 % intervals of a protocol's main numbers over its scenes."""
+    names = [str(row["scene_id"]) for row in scores.scenes]
+    return {
+        number: bootstrap_interval(
+            _counts(number, scores, names, _classes(scores)),
+            statistic,
+            num_resamples=num_resamples,
+            seed=seed,
+        )
+        for number, statistic in _statistics(scores).items()
     }
-    with replaced_folder(output, marker=MARKER) as folder:
-        (folder / MARKER).write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
-        for name, rows in tables.items():
-            write_csv(folder / name, rows)
-        if "strict" in scores:
-            misses = [row for row in scores["strict"].objects if row["cause"] != "found"]
-            content = {**metrics["strict"]["atlas"], "misses": misses}
-            (folder / "atlas.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-            name = str(metrics["predictions"]) if beside else output.name
-            draw_figure(folder, name, metrics["strict"]["curves"], beside)
 
 
-def _written(metrics: Mapping[str, Any]) -> list[str]:
-    of_strict = ["atlas.json", FIGURE] if "strict" in metrics else []
-    return [MARKER, "per_object.csv", "per_scene.csv", *of_strict]
+def compare(
+    first: ProtocolScores, second: ProtocolScores, *, num_resamples: int, seed: int
+) -> dict[str, Comparison]:
+    """Compare two sets of predictions under one protocol, on the scenes that count for both."""
+    others = {row["scene_id"] for row in second.scenes}
+    names = [str(row["scene_id"]) for row in first.scenes if row["scene_id"] in others]
+    classes = sorted({*_classes(first), *_classes(second)})
+    return {
+        number: compare_paired(
+            _counts(number, first, names, classes),
+            _counts(number, second, names, classes),
+            statistic,
+            num_resamples=num_resamples,
+            seed=seed,
+        )
+        for number, statistic in _statistics(first).items()
+    }
 
 
-def write_csv(path: Path, rows: Sequence[Row]) -> None:
-    """Write rows whose columns differ by protocol: a cell that a row lacks stays empty."""
-    columns = list(dict.fromkeys(column for row in rows for column in row)) or ["scene_id"]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, fieldnames=columns, restval="")
-        writer.writeheader()
-        writer.writerows(rows)
+def _statistics(scores: ProtocolScores) -> dict[str, Statistic]:
+    """Return the main numbers of a protocol and how each follows from sums over scenes."""
+    statistics: dict[str, Statistic] = {}
+    if "per_class" in scores.metrics:
+        statistics |= {"class_average": class_average, "global_average": global_average}
+    return statistics | {f"f1_{threshold}": f1 for threshold in scores.metrics.get("per_threshold", {})}
+
+
+def _classes(scores: ProtocolScores) -> list[str]:
+    """Return the classes that count; those of a protocol may be fewer than those of its rows."""
+    return [name for name, entry in scores.metrics.get("per_class", {}).items() if entry["n_total"]]
+
+
+def _counts(number: str, scores: ProtocolScores, names: Sequence[str], classes: Sequence[str]) -> Counts:
+    """Return what each scene adds to the sums behind a number, ``(S, C)``."""
+    if not number.startswith("f1_"):
+        return class_counts([row for row in scores.objects if row["category"] in classes], names, classes)
+    by_name = {row["scene_id"]: row for row in scores.scenes}
+    columns = (number.replace("f1", "n_matched"), "n_predicted", "n_true")
+    rows = [[float(by_name[name][column] or 0) for column in columns] for name in names]
+    return np.array(rows, dtype=np.float64).reshape(len(names), len(columns))

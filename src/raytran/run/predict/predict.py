@@ -6,8 +6,8 @@ from __future__ import annotations
 import logging
 import shlex
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
-from typing import Unpack
 
 from omegaconf import DictConfig
 
@@ -19,13 +19,13 @@ from raytran.checkpoints.network import trusted_packages
 from raytran.data.shapenet.models import shapenet_version
 from raytran.errors import ConfigError
 from raytran.model import RayTran
-from raytran.postprocess import object_meshes
+from raytran.postprocess import count_object_views, merge_volumes, object_meshes, select_objects
 from raytran.run.device import choose_device, set_matmul_precision
 from raytran.run.output import check_replaceable
-from raytran.run.predict.files import MARKER, PredictedScene, check_pictures, write_scene
-from raytran.run.predict.render import cameras_to_render, render_views
-from raytran.run.predict.room import Limits, RoomViews, check_choice, predict_room, predict_volume, read_room
-from raytran.structs import Views
+from raytran.run.predict.new_views import cameras_to_render, render_views
+from raytran.run.predict.room import RoomViews, check_choice, read_room
+from raytran.run.predict.write_scene import MARKER, PredictedScene, check_pictures, write_scene
+from raytran.structs import ScenePrediction
 from raytran.viewer.viewed import read_truth, viewed_volumes
 
 _LOG = logging.getLogger(__name__)
@@ -44,6 +44,9 @@ _WITHOUT_SHAPES = ("stage1", "stage2")
 RGB = 3
 """Channels of the images that a scene without annotation has."""
 
+_SAME_PLACE = 1e-4
+"""Metres within which a volume counts as centred on its cameras."""
+
 
 def predict(cfg: DictConfig) -> Path:
     """Run ``python -m raytran.predict``; see ``conf/predict.yaml``.
@@ -56,7 +59,7 @@ def predict(cfg: DictConfig) -> Path:
         CheckpointError: the checkpoint is missing or damaged.
         DataError: the scene's folder is missing or damaged.
     """
-    scene, output = Path(cfg.scene).resolve(), Path(cfg.output)
+    recording, output = Path(cfg.scene).resolve(), Path(cfg.output)
     world = WorldSettings(up=cfg.up, scale=cfg.scale, convention=cfg.convention, check=cfg.check)
     check_choice(cfg.frames, cfg.num_views)
     check_pictures(num_overlays=cfg.num_overlays, turntable=cfg.turntable)
@@ -72,13 +75,24 @@ def predict(cfg: DictConfig) -> Path:
     model = model.to(device)
     _check_channels(model, cfg.checkpoint)
     new_cameras = cameras_to_render(cfg.views, model, cfg.checkpoint)
-    scene_id = scene.stem if scene.is_file() else scene.name
+    scene_id = recording.stem if recording.is_file() else recording.name
     truth = read_truth(Path(cfg.truth), scene_id) if cfg.truth else None
-    room = _read(cfg, world, settings, model)
-    found = _find(cfg, model, room, scene_id, with_shapes=settings.stage not in _WITHOUT_SHAPES)
+    room = _read_room(cfg, world, settings, model)
+    scene = predict_scene(
+        model,
+        room,
+        scene_id=scene_id,
+        score_threshold=cfg.score_threshold,
+        duplicate_iou=cfg.duplicate_iou,
+        views_at_once=cfg.views_at_once,
+        with_shapes=settings.stage not in _WITHOUT_SHAPES,
+        for_viewer=cfg.viewer,
+    )
+    if cfg.cads:
+        scene = scene.with_cads(Path(cfg.cads))
     write_scene(
         output,
-        found,
+        scene,
         room.views,
         room.frame_ids,
         grid_extent=room.volumes.joint().extent,
@@ -88,52 +102,96 @@ def predict(cfg: DictConfig) -> Path:
     )
     if new_cameras is not None:
         render_views(model, room, new_cameras, output, views_at_once=cfg.views_at_once)
-    _report(output, found)
+    _report(output, scene)
     return output
 
 
-def predict_scene(model: RayTran, views: Views, **limits: Unpack[Limits]) -> PredictedScene:
-    """Run the network on the views of one scene, in one volume, and make all that ``write_scene`` writes.
+def predict_scene(
+    model: RayTran,
+    room: RoomViews,
+    *,
+    scene_id: str,
+    score_threshold: float,
+    duplicate_iou: float | None,
+    views_at_once: int | None = None,
+    with_shapes: bool = True,
+    for_viewer: bool = True,
+) -> PredictedScene:
+    """Predict a room, and make of it what ``write_scene`` writes.
 
     Args:
         model: the network, on any device.
-        views: B = 1.
-        limits: see ``predict_volume``.
+        room: frames and volumes.
+        scene_id: name to give the result.
+        score_threshold: objects with a lower score are left out.
+        duplicate_iou: of two objects of a class with a higher box IoU, the weaker is left out; None: neither.
+        views_at_once: frames that pass through the network together, None for all; fewer need less memory.
+        with_shapes: decode the objects' shapes.
+        for_viewer: keep for the viewer how the network read the frames.
 
     Returns:
         The result, on the CPU.
     """
-    with observe_attention(model) as observed:
-        prediction = predict_volume(model, views, **limits)
-    volumes = viewed_volumes(model, views, prediction, observed, grid_extent=model.grid_extent)
-    return PredictedScene(prediction, object_meshes(prediction), volumes=volumes)
-
-
-def _find(
-    cfg: DictConfig, model: RayTran, room: RoomViews, scene_id: str, *, with_shapes: bool
-) -> PredictedScene:
-    """Return the objects of a scene with what is made of them, and for the viewer how the network read it."""
-    with observe_attention(model) if cfg.viewer else nullcontext() as observed:
+    with observe_attention(model) if for_viewer else nullcontext() as observed:
         prediction = predict_room(
             model,
             room,
             scene_id=scene_id,
-            score_threshold=cfg.score_threshold,
-            duplicate_iou=cfg.duplicate_iou,
-            views_at_once=cfg.views_at_once,
+            score_threshold=score_threshold,
+            duplicate_iou=duplicate_iou,
+            views_at_once=views_at_once,
             with_shapes=with_shapes,
         )
     volumes = None
-    if cfg.viewer:
-        several = len(room.members) > 1
+    if for_viewer:
+        several = len(room.volumes) > 1
         parts = tuple(zip(room.volumes.center, room.members, strict=True)) if several else ()
         extent = room.volumes.joint().extent
         volumes = viewed_volumes(model, room.views, prediction, observed, grid_extent=extent, parts=parts)
-    found = PredictedScene(prediction, object_meshes(prediction), volumes=volumes)
-    return found.with_cads(Path(cfg.cads)) if cfg.cads else found
+    return PredictedScene(prediction, object_meshes(prediction), volumes=volumes)
 
 
-def _read(cfg: DictConfig, world: WorldSettings, settings: PredictionSettings, model: RayTran) -> RoomViews:
+def predict_room(
+    model: RayTran,
+    room: RoomViews,
+    *,
+    scene_id: str,
+    score_threshold: float,
+    duplicate_iou: float | None,
+    views_at_once: int | None = None,
+    with_shapes: bool = True,
+) -> ScenePrediction:
+    """Run the network in each volume of a room; arguments as of ``predict_scene``.
+
+    Returns:
+        The objects that count, each once, with the number of views that saw it, and the voxels over
+        ``room.volumes.joint()``, on the CPU.
+    """
+    device = next(model.parameters()).device
+    predictions = []
+    for volume, center in enumerate(room.volumes.center):
+        views = room.views_of(volume)
+        mean_position = views.world_from_camera[0, :, :3, 3].double().mean(dim=0)
+        # The network centres a volume on its cameras itself: asked to, it gives the same to the last bit.
+        is_centered = float((center - mean_position).abs().max()) <= _SAME_PLACE
+        grid_center = None if len(room.volumes) == 1 and is_centered else center.float().to(device)
+        prediction = model.predict(
+            views.to(device),
+            scene_id=scene_id,
+            score_threshold=score_threshold,
+            views_at_once=views_at_once,
+            with_shapes=with_shapes,
+            grid_center=grid_center,
+        ).to("cpu")
+        prediction = select_objects(prediction, score_threshold=score_threshold, duplicate_iou=duplicate_iou)
+        objects = count_object_views(prediction, grid_extent=model.grid_extent)
+        predictions.append(replace(prediction, objects=objects))
+    return predictions[0] if len(predictions) == 1 else merge_volumes(predictions, room.volumes)
+
+
+def _read_room(
+    cfg: DictConfig, world: WorldSettings, settings: PredictionSettings, model: RayTran
+) -> RoomViews:
     """Return the frames that the network is given, and its volumes."""
     with open_scene(Path(cfg.scene).resolve(), format=cfg.format, settings=world) as scan:
         return read_room(
@@ -155,15 +213,15 @@ def _check_channels(model: RayTran, checkpoint: str) -> None:
         )
 
 
-def _report(output: Path, found: PredictedScene) -> None:
-    count, meshes = len(found.prediction.objects), sum(mesh is not None for mesh in found.meshes)
+def _report(output: Path, scene: PredictedScene) -> None:
+    count, meshes = len(scene.prediction.objects), sum(mesh is not None for mesh in scene.meshes)
     if count:
-        _LOG.info("%s: %d objects, %d of them with a mesh", found.prediction.scene_id, count, meshes)
+        _LOG.info("%s: %d objects, %d of them with a mesh", scene.prediction.scene_id, count, meshes)
     else:
         _LOG.info(
             "%s: no object has a score above the threshold; lower score_threshold to see weaker ones",
-            found.prediction.scene_id,
+            scene.prediction.scene_id,
         )
     _LOG.info("wrote %s: %s", output.resolve(), ", ".join(sorted(path.name for path in output.iterdir())))
-    if found.volumes is not None:
+    if scene.volumes is not None:
         _LOG.info("look at it: python -m raytran.view %s", shlex.quote(str(output)))

@@ -20,10 +20,9 @@ from raytran.data.files import disk_full, finished_folder
 from raytran.data.views import choose_even
 from raytran.model import inputs_of
 from raytran.pictures.scene_pictures import draw_scene
-from raytran.postprocess import select_objects
+from raytran.postprocess import DUPLICATE_IOU, SCORE_THRESHOLD, select_objects
 from raytran.structs import SceneBatch, ScenePrediction
 from raytran.training.reconstruction import Reconstruction
-from raytran.training.scores import DUPLICATE_IOU, SCORE_THRESHOLD
 
 _log = logging.getLogger(__name__)
 

@@ -1,71 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Metrics that keep one record a scene, gathered exactly over the ranks of a distributed run."""
+"""Base classes of our metrics: a record for each scene, which counts once on however many ranks."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal, cast
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
+from torch import distributed as dist
 from torch.nn import Module
 from torchmetrics import Metric
-from torchmetrics.utilities import dim_zero_cat
-from torchmetrics.utilities.distributed import gather_all_tensors
 
 from raytran.errors import ShapeError
-from raytran.structs import CadAlignments, ObjectSet
+from raytran.structs import CadAlignments, ObjectSet, TensorStruct
 
 Row = dict[str, str | int | float | bool | None]
 """One line of a table: column name to value, None where there is none."""
 
 
 @dataclass(frozen=True)
-class SceneRecord:
-    """The verdict on one scene.
+class SceneRecord(TensorStruct):
+    """What a metric found in one scene, float64 on the CPU.
 
     Attributes:
         scene_id: name of the scene.
-        truths: ``(M, columns)`` float64, one row for each true object.
-        predictions: ``(P, columns)`` float64, one row for each prediction.
+        truths: ``(M, columns)``, one row for each true object, or for whatever else the metric counts.
+        predictions: ``(P, columns)``, one row for each prediction, of the metrics over objects.
     """
 
     scene_id: str
     truths: Tensor
-    predictions: Tensor
-
-    def encode(self) -> Tensor:
-        """Return the record as one float64 vector: three lengths, the letters of the name, the tables."""
-        name = [float(ord(letter)) for letter in self.scene_id]
-        lengths = [float(len(name)), float(len(self.truths)), float(len(self.predictions))]
-        head = self.truths.new_tensor(lengths + name, dtype=torch.float64)
-        return torch.cat([head, self.truths.double().flatten(), self.predictions.double().flatten()])
+    predictions: Tensor = field(default_factory=lambda: torch.zeros(0, 0, dtype=torch.float64))
 
 
-def decode_records(stream: Tensor, truth_columns: int, prediction_columns: int) -> Iterator[SceneRecord]:
-    """Take apart a vector of encoded records laid end to end."""
-    position = 0
-    while position < len(stream):
-        n_letters, n_truths, n_predictions = (int(n) for n in stream[position : position + 3])
-        parts = [n_letters, n_truths * truth_columns, n_predictions * prediction_columns]
-        name, truths, predictions = stream[position + 3 : position + 3 + sum(parts)].split(parts)
-        yield SceneRecord(
-            "".join(chr(int(letter)) for letter in name),
-            truths.reshape(n_truths, truth_columns),
-            predictions.reshape(n_predictions, prediction_columns),
-        )
-        position += 3 + sum(parts)
-
-
-def _gather_float64(value: Tensor, group: Any = None) -> list[Tensor]:
-    """Gather vectors of any length from all ranks; a rank without scenes sends an empty float32 one."""
-    return gather_all_tensors(value.double(), group)
-
-
-class RecordMetric(Metric):
-    """Base of all our metrics: what is found in a scene is kept as a record, in float64 in any run.
+class SceneMetric(Metric):
+    """Base of all our metrics: a record for each scene, in float64 in any run.
 
     A scene is known by its id and counts once: a distributed sampler that repeats scenes to make the ranks
     equal changes no result.
@@ -76,52 +48,55 @@ class RecordMetric(Metric):
     full_state_update = False
 
     truth_columns: int
-    prediction_columns: int
-    records: list[Tensor] | Tensor
+    records: list[SceneRecord]
 
     def __init__(self, **kwargs: Any) -> None:
-        super().__init__(dist_sync_fn=_gather_float64, **kwargs)
-        self.add_state("records", default=[], dist_reduce_fx="cat")
+        super().__init__(**kwargs)
+        self.add_state("records", default=[], dist_reduce_fx=None)
 
-    def keep(self, record: SceneRecord) -> None:
+    def add(self, record: SceneRecord) -> None:
         """Add the record of a scene."""
-        records = cast("list[Tensor]", self.records)  # a tensor only while synchronised
-        records.append(record.encode().to(self._record_device()))
+        self.records.append(record)
 
     def scenes(self) -> list[SceneRecord]:
         """Return the records in this process, or of all ranks while they are synchronised, one a scene."""
-        if isinstance(self.records, list) and not self.records:
-            return []
-        stream = dim_zero_cat(self.records).cpu()
-        found: dict[str, SceneRecord] = {}
-        for record in decode_records(stream, self.truth_columns, self.prediction_columns):
-            found.setdefault(record.scene_id, record)
-        return list(found.values())
+        first: dict[str, SceneRecord] = {}
+        for record in self.records:
+            first.setdefault(record.scene_id, record)
+        return list(first.values())
+
+    def truths(self) -> Tensor:
+        """Return the rows ``truths`` of all scenes, ``(N, truth_columns)`` float64."""
+        none = torch.zeros(0, self.truth_columns, dtype=torch.float64)
+        return torch.cat([none, *(record.truths for record in self.scenes())])
 
     def synchronised_scenes(self) -> list[SceneRecord]:
         """Return the records of all ranks, one a scene; every rank must call it."""
-        with self.sync_context(dist_sync_fn=self.dist_sync_fn):
+        with self.sync_context():
             return self.scenes()
 
+    def _sync_dist(self, dist_sync_fn: Callable[..., Any] | None = None, process_group: Any = None) -> None:
+        """Gather the records of all ranks: torchmetrics itself gathers tensors only."""
+        group = process_group or self.process_group
+        of_ranks: list[list[SceneRecord]] = [[] for _ in range(dist.get_world_size(group))]
+        dist.all_gather_object(of_ranks, self.records, group=group)
+        self.records = [record for records in of_ranks for record in records]
+
     def _apply(self, fn: Callable[[Tensor], Tensor], exclude_state: Sequence[str] = ()) -> Module:
-        """Follow the module to another device but not to another type: bf16 would garble the records."""
+        """Leave the records as they are when the module changes device or type: bf16 would garble them."""
         super()._apply(fn, exclude_state=(*exclude_state, "records"))
-        if isinstance(self.records, list):
-            self.records = [record.to(self._record_device()) for record in self.records]
         self._computed = None  # the base class has cast it
         return self
 
-    def _record_device(self) -> torch.device:
-        return torch.device("cpu") if self.device.type == "mps" else self.device  # MPS has no float64
 
-
-class SceneRecordMetric(RecordMetric):
+class ObjectMetric(SceneMetric):
     """Base of the metrics over objects: each scene is judged when it is given.
 
     Every scene given counts, with or without predictions, unless ``drops_missing``: then a scene whose
     predictions are None, for which there is no result at all, is left out.
     """
 
+    prediction_columns: int
     judges_shapes = False  # else ``judge`` is given the objects without their shapes
     drops_missing: bool = False
 
@@ -163,7 +138,12 @@ class SceneRecordMetric(RecordMetric):
                 continue
             found = type(target).empty() if predicted is None else predicted
             tables = self.judge(*(self._in_float64(objects) for objects in (found, target)))
-            self.keep(SceneRecord(scene_id, *tables))
+            self.add(SceneRecord(scene_id, *tables))
+
+    def predictions(self) -> Tensor:
+        """Return the rows ``predictions`` of all scenes, ``(N, prediction_columns)`` float64."""
+        none = torch.zeros(0, self.prediction_columns, dtype=torch.float64)
+        return torch.cat([none, *(record.predictions for record in self.scenes())])
 
     def rows(self, per: Literal["object", "scene"] = "object") -> list[Row]:
         """Return a table of all ranks' scenes; in a distributed run every rank must call it.
@@ -190,7 +170,7 @@ class SceneRecordMetric(RecordMetric):
         )
 
 
-class ProtocolMetric(SceneRecordMetric):
+class ProtocolMetric(ObjectMetric):
     """Base of the metrics that follow a protocol: ``strict`` on boxes, published scripts on alignments."""
 
     protocol: str

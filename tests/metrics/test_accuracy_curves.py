@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from raytran.metrics import Scan2CADAccuracy
-from raytran.metrics.curves import FACTORS, AccuracyCurves, accuracy_by_scene_size
+from raytran.metrics.accuracy_curves import FACTORS, AccuracyCurves, accuracy_by_scene_size
 from raytran.structs import ObjectSet
 
 from .scenes import CHAIR, objects, random_scene

@@ -7,13 +7,8 @@ import pytest
 import torch
 
 from raytran.errors import DataError
-from raytran.export.scan2cad_csv import (
-    ROCA_COLUMNS,
-    SCAN2CAD_COLUMNS,
-    read_alignments_csv,
-    read_roca_csv,
-    write_alignments_csv,
-)
+from raytran.export.cad_alignments import SCAN2CAD_COLUMNS, write_alignments_csv
+from raytran.export.read import ROCA_COLUMNS, read_alignments_csv, read_roca_csv
 from raytran.structs import CadAlignments
 
 ROW = "03001627,abc,1,2,3,1,0,0,0,0.5,0.6,0.7"

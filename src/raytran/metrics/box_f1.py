@@ -11,17 +11,18 @@ from torch import Tensor
 
 from raytran.errors import ConfigError
 from raytran.geometry.boxes import OrientedBoxes, box_iou
-from raytran.metrics.functional.box_f1 import (
+from raytran.metrics.functional.cad_errors import cad_half_extents
+from raytran.metrics.functional.detection import (
     BestScores,
     DetectionScores,
     average_precision,
     best_f1,
     detection_scores,
+    match_in_order,
+    score_order,
 )
-from raytran.metrics.functional.cad_errors import cad_half_extents
-from raytran.metrics.functional.matching import match_in_order, score_order
 from raytran.metrics.functional.odam import bev_iou, odam_predicted_boxes, odam_true_boxes
-from raytran.metrics.records import ProtocolMetric, Row, SceneRecord
+from raytran.metrics.per_scene import ProtocolMetric, Row, SceneRecord
 from raytran.structs import CLASSES, CadAlignments, ObjectSet
 
 BOX_F1_PROTOCOLS: tuple[str, ...] = ("strict", "odam")
@@ -136,15 +137,12 @@ class OrientedBoxF1(ProtocolMetric):
 
     def compute(self) -> BoxF1Result:
         """Return precision, recall, F1 and counts at each IoU threshold."""
-        scenes = self.scenes()
-        empty = torch.zeros(0, self.prediction_columns, dtype=torch.float64)
-        predictions = torch.cat([empty, *(scene.predictions for scene in scenes)])
-        truths = torch.cat([empty, *(_counted(scene.truths) for scene in scenes)])
+        predictions, truths = self.predictions(), _counted(self.truths())
         per_threshold = {
             f"{threshold:g}": self._scores_at(column, predictions, truths[:, 0])
             for column, threshold in enumerate(self.iou_thresholds, start=2)
         }
-        return BoxF1Result(per_threshold=per_threshold, n_scenes=len(scenes))
+        return BoxF1Result(per_threshold=per_threshold, n_scenes=len(self.scenes()))
 
     @staticmethod
     def _scores_at(column: int, predictions: Tensor, true_label: Tensor) -> ThresholdScores:

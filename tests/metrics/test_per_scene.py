@@ -27,10 +27,9 @@ from raytran.metrics import (
     Scan2CADAccuracy,
     SceneOccupancyIoU,
 )
-from raytran.metrics.atlas import ErrorAtlas
-from raytran.metrics.curves import AccuracyCurves
+from raytran.metrics.accuracy_curves import AccuracyCurves
+from raytran.metrics.error_atlas import ErrorAtlas
 from raytran.metrics.functional.cad_errors import cad_half_extents, cad_symmetries
-from raytran.metrics.records import SceneRecord, decode_records
 from raytran.structs import CadAlignments, ObjectSet, Views
 
 SCENES = 7
@@ -186,17 +185,13 @@ def test_bf16_predictions_are_judged_as_they_are():
         assert metric.compute().isfinite()
 
 
-def test_records_survive_encoding():
-    records = [
-        SceneRecord("scene0470_00", torch.rand(3, 2).double(), torch.rand(0, 4).double()),
-        SceneRecord("", torch.zeros(0, 2).double(), torch.full((2, 4), torch.nan).double()),
-        SceneRecord("客厅", torch.rand(1, 2).double(), torch.rand(1, 4).double()),
-    ]
-    decoded = list(decode_records(torch.cat([record.encode() for record in records]), 2, 4))
-    for record, copied in zip(records, decoded, strict=True):
-        assert copied.scene_id == record.scene_id
-        torch.testing.assert_close(copied.truths, record.truths, rtol=0, atol=0)
-        torch.testing.assert_close(copied.predictions, record.predictions, rtol=0, atol=0, equal_nan=True)
+def test_torchmetrics_own_ways_of_use():
+    prediction, target, name = scene(5)
+    expected = results((5,))["scan2cad"]
+    metric = Scan2CADAccuracy(compute_on_cpu=True)
+    assert metric([prediction], [target], [name]) == expected
+    metric([prediction], [target], ["another"])
+    assert metric.compute()["n_total"] == 2 * expected["n_total"]
 
 
 def test_copy_reset_and_move():

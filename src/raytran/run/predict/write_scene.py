@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a prediction of one scene leaves behind: every file a user looks at, in one folder."""
+"""Write a predicted scene: every file a user looks at, in one folder."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ import trimesh
 
 from raytran.errors import ConfigError
 from raytran.export import write_prediction
+from raytran.export.cad_alignments import ALIGNMENTS, write_alignments_csv
 from raytran.export.glb import write_glb
 from raytran.export.nearest_cad import NearestCads, nearest_cads
-from raytran.export.scan2cad_csv import ALIGNMENTS, write_alignments_csv
 from raytran.geometry.camera import Cameras
 from raytran.pictures.overlay import draw_overlays
 from raytran.pictures.topdown import draw_topdown
@@ -65,7 +65,7 @@ def check_pictures(**counts: object) -> None:
 
 def write_scene(
     output: Path,
-    found: PredictedScene,
+    scene: PredictedScene,
     views: Views,
     frame_ids: Sequence[str],
     *,
@@ -78,7 +78,7 @@ def write_scene(
 
     Args:
         output: folder; replaced if it is an earlier result.
-        found: what was predicted.
+        scene: what was predicted.
         views: B = 1, what it was predicted from.
         frame_ids: name of each frame.
         grid_extent: sizes of the voxel grid, metres.
@@ -89,7 +89,7 @@ def write_scene(
     Raises:
         ConfigError: ``output`` holds something that is no earlier result.
     """
-    prediction = found.prediction
+    prediction = scene.prediction
     cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], views.image_size)
     with replaced_folder(output, marker=MARKER) as folder:
         draw_topdown(
@@ -99,16 +99,16 @@ def write_scene(
             draw_turntable(
                 folder / "turntable.gif",
                 prediction.objects,
-                found.meshes,
+                scene.meshes,
                 cameras=cameras,
                 num_frames=turntable,
             )
-        draw_overlays(folder / "overlays", views, frame_ids, prediction, found.meshes, count=num_overlays)
-        if found.cads is not None:
-            write_alignments_csv(folder / ALIGNMENTS, found.cads.alignments())
-            write_glb(folder / "cads.glb", prediction.objects, found.cads.meshes())
-        if found.volumes is not None:
-            write_view_data(folder, prediction, views, frame_ids, volumes=found.volumes, truth=truth)
+        draw_overlays(folder / "overlays", views, frame_ids, prediction, scene.meshes, count=num_overlays)
+        if scene.cads is not None:
+            write_alignments_csv(folder / ALIGNMENTS, scene.cads.alignments())
+            write_glb(folder / "cads.glb", prediction.objects, scene.cads.meshes())
+        if scene.volumes is not None:
+            write_view_data(folder, prediction, views, frame_ids, volumes=scene.volumes, truth=truth)
         write_prediction(
-            folder, prediction, found.meshes, cameras=cameras, frame_ids=frame_ids, grid_extent=grid_extent
+            folder, prediction, scene.meshes, cameras=cameras, frame_ids=frame_ids, grid_extent=grid_extent
         )

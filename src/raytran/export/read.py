@@ -1,25 +1,38 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Predictions of many scenes from files that anybody may have written."""
+"""Predictions read from files that anybody may have written: ``scene.json``, Scan2CAD's and ROCA's CSV."""
 
 from __future__ import annotations
 
+import csv
+import json
 import logging
+import math
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from raytran.errors import DataError
-from raytran.export.alignments import align_cads
-from raytran.export.scan2cad_csv import ALIGNMENTS, read_alignments_csv, read_roca_csv
-from raytran.export.scene_json import read_scene_json
+from raytran.export.cad_alignments import ALIGNMENTS, SCAN2CAD_COLUMNS, align_cads
+from raytran.export.write import FORMAT
 from raytran.geometry.rotation import matrix_from_quaternion
-from raytran.structs import CLASS_BY_CATID, CLASSES, CadAlignments, ObjectSet
+from raytran.structs import CLASS_BY_CATID, CLASSES, CadAlignments, ObjectSet, ScenePrediction
 
 _log = logging.getLogger(__name__)
+
+ROCA_COLUMNS: tuple[str, ...] = (
+    *("id_scan", "objectCategory", "alignedModelId", *SCAN2CAD_COLUMNS[2:], "object_score"),
+)
+"""The 14 columns of ROCA's result file (vid2cad_evaluation.py)."""
+
+_CATID_DIGITS = 8
+
+_UNIT_TOLERANCE = 1e-3
+"""Quaternions written with four digits still count as of length one."""
 
 _THINNEST = 1e-3
 """Least size of a box, metres, as of annotated objects: a CAD model may be a flat sheet."""
@@ -84,13 +97,16 @@ def read_predictions(path: Path, scene_ids: Collection[str], cad_boxes: CadBoxes
     """
     if path.is_file():
         alignments = read_roca_csv(path)
-        found = {name: _from_alignments(path, value, cad_boxes) for name, value in alignments.items()}
-        scenes = {name: value for name, value in found.items() if name in scene_ids}
-        ignored = tuple(found.keys() - scenes.keys())
+        ignored = tuple(alignments.keys() - set(scene_ids))
+        scenes = {
+            name: _from_alignments(path, alignments[name], cad_boxes)
+            for name in alignments
+            if name in scene_ids
+        }
     else:
         files = _files_by_scene(path)
         ignored = tuple(name for name in files if name not in scene_ids)
-        scenes = {name: _read(files[name], name, cad_boxes) for name in files if name in scene_ids}
+        scenes = {name: _read_scene(files[name], name, cad_boxes) for name in files if name in scene_ids}
     if not scenes:
         raise DataError(
             f"{path} holds no predictions for any of the {len(scene_ids)} annotated scenes: name the files "
@@ -130,7 +146,7 @@ def _files_by_scene(folder: Path) -> dict[str, Path]:
     return files
 
 
-def _read(path: Path, scene_id: str, cad_boxes: CadBoxes) -> ScenePredictions:
+def _read_scene(path: Path, scene_id: str, cad_boxes: CadBoxes) -> ScenePredictions:
     if path.suffix == ".csv":
         return _from_alignments(path, read_alignments_csv(path), cad_boxes)
     prediction = read_scene_json(path)
@@ -206,7 +222,183 @@ def _from_objects(path: Path, objects: ObjectSet, cad_boxes: CadBoxes) -> SceneP
 def _lookup(names: Collection[str], cad_boxes: CadBoxes) -> tuple[Tensor, Tensor]:
     """Return centres and half extents, ``(M, 3)`` each; those of a name that is unknown are 0 and 1/2."""
     unit = (torch.zeros(3, dtype=torch.float64), torch.full((3,), 0.5, dtype=torch.float64))
-    found = [cad_boxes.get(name, unit) for name in names]
-    if not found:
+    boxes = [cad_boxes.get(name, unit) for name in names]
+    if not boxes:
         return torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64)
-    return torch.stack([center for center, _ in found]), torch.stack([half for _, half in found])
+    return torch.stack([center for center, _ in boxes]), torch.stack([half for _, half in boxes])
+
+
+def read_scene_json(path: Path) -> ScenePrediction:
+    """Read what ``write_scene_json`` wrote; the numbers are float64, as written.
+
+    Returns:
+        The objects, with symmetry 1 and no shapes. The file does not hold the voxel grid, so ``grid_center``
+        is NaN.
+
+    Raises:
+        DataError: the file is missing, damaged, of another format, or names an unknown category.
+    """
+    try:
+        content = json.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise DataError(f"no scene file at {path}; write one with `python -m raytran.predict`") from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(f"cannot read {path} as JSON ({error}); write it again") from error
+    named = content.get("format") if isinstance(content, dict) else None
+    if named != FORMAT:
+        raise DataError(f"{path} has format {named!r}, this version reads {FORMAT!r}; write it again")
+    try:
+        return ScenePrediction(
+            scene_id=str(content["scene_id"]),
+            objects=_objects_from_json(content["objects"]),
+            grid_center=torch.full((3,), torch.nan),
+        )
+    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
+        raise DataError(
+            f"an object in {path} is incomplete or malformed ({error!r}); write it again"
+        ) from error
+
+
+def _objects_from_json(entries: Sequence[dict[str, Any]]) -> ObjectSet:
+    count = len(entries)
+
+    def column(key: str, *shape: int) -> torch.Tensor:
+        return torch.tensor([entry[key] for entry in entries], dtype=torch.float64).reshape(count, *shape)
+
+    models = tuple("/".join((e["catid_cad"], e["id_cad"])) if e.get("id_cad") else "" for e in entries)
+    return ObjectSet(
+        label=torch.tensor([CLASSES.index(entry["category"]) for entry in entries], dtype=torch.int64),
+        center=column("center", 3),
+        size=column("size", 3),
+        rotation=column("rotation", 3, 3),
+        symmetry=torch.ones(count, dtype=torch.int64),
+        score=column("score"),
+        model_id=models if any(models) else (),
+    )
+
+
+class _Row(NamedTuple):
+    line: int
+    names: list[str]
+    values: list[float]
+
+
+def read_alignments_csv(path: Path) -> CadAlignments:
+    """Read the predictions for one scan, 12 columns a row; a header row and blank lines are skipped.
+
+    Quaternions and categories are kept as given, but one sentence warns of quaternions not of length one and
+    of categories without eight digits: the official script takes them as they are, and the latter match
+    nothing.
+
+    Args:
+        path: ``<id_scan>.csv``.
+
+    Raises:
+        DataError: the file cannot be read, or a row has another number of columns, a value that is no
+            finite number, a quaternion of length zero or a scale that is not positive.
+    """
+    rows = _read_rows(Path(path), SCAN2CAD_COLUMNS, 2)
+    short = [row for row in rows if len(row.names[0]) != _CATID_DIGITS]
+    if short:
+        _log.warning(
+            "%s, line %d: catid_cad %r does not have eight digits (%d such lines) and matches nothing",
+            *(path, short[0].line, short[0].names[0], len(short)),
+        )
+    return _alignments_from_rows(rows)
+
+
+def read_roca_csv(path: Path) -> dict[str, CadAlignments]:
+    """Read the predictions for many scans, 14 columns a row, as ``read_alignments_csv`` does.
+
+    ROCA writes categories as numbers; they get their leading zeros back.
+
+    Args:
+        path: the file; the rows of a scan need not be neighbours.
+
+    Returns:
+        the alignments of each scan that has any, in the order of first appearance.
+
+    Raises:
+        DataError: see ``read_alignments_csv``.
+    """
+    by_scene: dict[str, list[_Row]] = {}
+    for row in _read_rows(Path(path), ROCA_COLUMNS, 3):
+        scene_id, category, name = row.names
+        by_scene.setdefault(scene_id, []).append(row._replace(names=[category.zfill(_CATID_DIGITS), name]))
+    return {scene_id: _alignments_from_rows(rows) for scene_id, rows in by_scene.items()}
+
+
+def _read_rows(path: Path, columns: tuple[str, ...], n_names: int) -> list[_Row]:
+    rows: list[_Row] = []
+    not_unit: list[int] = []
+    try:
+        table = list(csv.reader(path.read_text(encoding="utf-8-sig").splitlines()))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise DataError(f"cannot read the alignments {path} ({error}): check the path") from error
+    for line, cells in enumerate(table, start=1):
+        cells = [cell.strip() for cell in cells]
+        if not any(cells):
+            continue
+        if len(cells) != len(columns):
+            raise DataError(
+                f"{path}, line {line} has {len(cells)} columns: write the {len(columns)} columns "
+                f"{','.join(columns)}"
+            )
+        if not rows and _is_header(cells[n_names:]):
+            _log.warning("%s, line %d: skipped a header row", path, line)
+            continue
+        row = _Row(line, cells[:n_names], _numbers(cells[n_names:], columns[n_names:], path, line))
+        if abs(_checked_length(row, path) - 1) > _UNIT_TOLERANCE:
+            not_unit.append(line)
+        rows.append(row)
+    if not_unit:
+        _log.warning(
+            "%s, line %d: the quaternion is not of length one (%d such lines); official protocols take it "
+            "as it is",
+            *(path, not_unit[0], len(not_unit)),
+        )
+    return rows
+
+
+def _is_header(cells: list[str]) -> bool:
+    """Return whether not one of the cells is a number."""
+    return not any(_parses(float, cell) for cell in cells)
+
+
+def _parses(parse: Callable[[str], float], cell: str) -> bool:
+    try:
+        parse(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _numbers(cells: list[str], columns: tuple[str, ...], path: Path, line: int) -> list[float]:
+    for name, cell in zip(columns, cells, strict=True):
+        if not _parses(float, cell) or not math.isfinite(float(cell)):
+            raise DataError(f"{path}, line {line}: {name} is {cell[:50]!r}, write a finite number")
+    return [float(cell) for cell in cells]
+
+
+def _checked_length(row: _Row, path: Path) -> float:
+    """Return the length of a row's quaternion; a pose that no object can have is an error."""
+    length = math.hypot(*row.values[3:7])
+    if length == 0:
+        raise DataError(f"{path}, line {row.line}: the quaternion has length zero, write a rotation")
+    if min(row.values[7:10]) <= 0:
+        raise DataError(f"{path}, line {row.line}: a scale is not positive, write sizes in metres a CAD unit")
+    return length
+
+
+def _alignments_from_rows(rows: list[_Row]) -> CadAlignments:
+    numbers = torch.tensor([row.values for row in rows], dtype=torch.float64)
+    numbers = numbers.reshape(len(rows), len(rows[0].values) if rows else 10)
+    scored = numbers.shape[1] > 10
+    return CadAlignments(
+        catid=tuple(row.names[0] for row in rows),
+        id_cad=tuple(row.names[1] for row in rows),
+        translation=numbers[:, :3],
+        quaternion=numbers[:, 3:7],
+        scale=numbers[:, 7:10],
+        score=numbers[:, 10] if scored else torch.ones(len(rows), dtype=torch.float64),
+    )

@@ -12,13 +12,12 @@ import torch
 import trimesh
 
 from raytran.data.shapenet.voxelize import voxelize_solid
-from raytran.export.scan2cad_csv import read_alignments_csv
+from raytran.export.read import read_alignments_csv, read_predictions
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.postprocess import object_meshes
 from raytran.rooms.cad import CadModel, sample_model
 from raytran.rooms.shapenet_files import write_model
-from raytran.run.evaluate.files import read_predictions
-from raytran.run.predict.files import PredictedScene, write_scene
+from raytran.run.predict.write_scene import PredictedScene, write_scene
 from raytran.structs import CLASSES, ObjectSet, ScenePrediction, Views
 
 FILES = {"scene.json", "scene.glb", "meshes", "occupancy.ply", "topdown.png", "overlays"}

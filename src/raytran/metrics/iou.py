@@ -10,15 +10,14 @@ import torch
 from torch import Tensor
 
 from raytran.errors import ShapeError
-from raytran.metrics.records import RecordMetric, SceneRecord
+from raytran.metrics.per_scene import SceneMetric, SceneRecord
 
 
-class _PooledIoU(RecordMetric):
+class _PooledIoU(SceneMetric):
     """Sum of the intersections over sum of the unions, so that large scenes weigh more than small ones."""
 
     # One row for a scene: cells in the intersection, cells in the union.
     truth_columns = 2
-    prediction_columns = 0
 
     def __init__(self, *, threshold: float = 0.5, **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -43,13 +42,11 @@ class _PooledIoU(RecordMetric):
         predicted, true = probability > self.threshold, target.bool()
         both, either = ((predicted & true).flatten(1).sum(dim=1), (predicted | true).flatten(1).sum(dim=1))
         for name, *counts in zip(scene_ids, both.tolist(), either.tolist(), strict=True):
-            table = torch.tensor([counts], dtype=torch.float64)
-            self.keep(SceneRecord(name, table, table.new_zeros(0, self.prediction_columns)))
+            self.add(SceneRecord(name, torch.tensor([counts], dtype=torch.float64)))
 
     def compute(self) -> Tensor:
         """Return the IoU, a float64 scalar; 0 if nothing is predicted and nothing is true."""
-        none = torch.zeros(1, self.truth_columns, dtype=torch.float64)
-        both, either = torch.cat([none, *(scene.truths for scene in self.scenes())]).sum(dim=0)
+        both, either = self.truths().sum(dim=0)
         return both / either.clamp(min=1)
 
 

@@ -15,7 +15,7 @@ from raytran.capture.camera_list import CameraList
 from raytran.capture.lens import Lens
 from raytran.errors import ConfigError, DataError
 from raytran.geometry.volumes import Volumes
-from raytran.run.predict.render import cameras_to_render, render_views
+from raytran.run.predict.new_views import cameras_to_render, render_views
 from raytran.run.predict.room import RoomViews
 from raytran.structs import Views
 

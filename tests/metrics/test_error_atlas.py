@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from raytran.metrics import Scan2CADAccuracy
-from raytran.metrics.atlas import CAUSES, FATES, ErrorAtlas
+from raytran.metrics.error_atlas import CAUSES, FATES, ErrorAtlas
 from raytran.structs import CLASSES, ObjectSet
 
 from .scenes import CHAIR, objects, random_scene

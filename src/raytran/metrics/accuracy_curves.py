@@ -12,23 +12,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from raytran.metrics.functional.alignment import alignment_errors
-from raytran.metrics.functional.matching import score_order
-from raytran.metrics.records import Row, SceneRecord, SceneRecordMetric
+from raytran.metrics.functional.alignment import SCAN2CAD_LIMITS, alignment_errors
+from raytran.metrics.functional.detection import score_order
+from raytran.metrics.per_scene import ObjectMetric, Row, SceneRecord
 from raytran.structs import CLASSES, ObjectSet
 
-DEFAULT_LIMITS = (0.2, 20.0, 0.2)
-"""Metres, degrees and ratio of the Scan2CAD benchmark."""
-
 FACTORS: tuple[float, ...] = tuple(round(0.1 * step, 1) for step in range(1, 31))
-"""Multiples of the default limits at which the curves are sampled: 2 cm … 60 cm, 2° … 60°, 2 % … 60 %."""
+"""Multiples of ``SCAN2CAD_LIMITS`` at which the curves are sampled: 2 cm … 60 cm, 2° … 60°, 2 % … 60 %."""
 
 SCENE_SIZES: tuple[int, ...] = (10, 20, 30)
 """Largest numbers of objects of the scenes that are also reported apart (RayTran §4)."""
 
 
 class Curve(NamedTuple):
-    """One curve: the limits that vary are multiples of the default, the others are infinite."""
+    """One curve: the limits that vary are multiples of ``SCAN2CAD_LIMITS``, the others are infinite."""
 
     name: str
     varies: tuple[bool, bool, bool]
@@ -51,7 +48,7 @@ class CurveResult(TypedDict):
     global_average: list[float]
 
 
-class AccuracyCurves(SceneRecordMetric):
+class AccuracyCurves(ObjectMetric):
     """Accuracy of protocol ``strict`` at many thresholds; the matching is made anew at each of them.
 
     Three curves vary one threshold and leave the other two errors out of account; the fourth scales the three
@@ -77,8 +74,7 @@ class AccuracyCurves(SceneRecordMetric):
 
     def compute(self) -> dict[str, CurveResult]:
         """Return each curve by name."""
-        records = [record.truths for record in self.scenes()]
-        truths = torch.cat([torch.zeros(0, self.truth_columns, dtype=torch.float64), *records])
+        truths = self.truths()
         one_hot = torch.nn.functional.one_hot(truths[:, 0].long(), len(CLASSES)).double()
         total = one_hot.sum(dim=0)
         good = truths[:, 1:].T @ one_hot
@@ -88,7 +84,7 @@ class AccuracyCurves(SceneRecordMetric):
         curves: dict[str, CurveResult] = {}
         for index, curve in enumerate(CURVES):
             part = slice(index * len(FACTORS), (index + 1) * len(FACTORS))
-            unit = 1.0 if curve.name == "joint" else DEFAULT_LIMITS[index]
+            unit = 1.0 if curve.name == "joint" else SCAN2CAD_LIMITS[index]
             curves[curve.name] = CurveResult(
                 threshold=[_scaled(unit, factor) for factor in FACTORS],
                 class_average=class_average[part].tolist(),
@@ -143,7 +139,7 @@ def _all_limits() -> list[tuple[float, ...]]:
     return [
         tuple(
             _scaled(limit, factor) if varies else np.inf
-            for limit, varies in zip(DEFAULT_LIMITS, curve.varies, strict=True)
+            for limit, varies in zip(SCAN2CAD_LIMITS, curve.varies, strict=True)
         )
         for curve in CURVES
         for factor in FACTORS

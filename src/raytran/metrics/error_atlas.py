@@ -9,10 +9,9 @@ from typing import Any, TypedDict
 import torch
 from torch import Tensor
 
-from raytran.metrics.curves import DEFAULT_LIMITS
-from raytran.metrics.functional.alignment import alignment_errors
-from raytran.metrics.functional.matching import match_in_order, score_order
-from raytran.metrics.records import Row, SceneRecord, SceneRecordMetric
+from raytran.metrics.functional.alignment import SCAN2CAD_LIMITS, alignment_errors
+from raytran.metrics.functional.detection import match_in_order, score_order
+from raytran.metrics.per_scene import ObjectMetric, Row, SceneRecord
 from raytran.structs import CLASSES, ObjectSet
 
 CAUSES: tuple[str, ...] = (
@@ -40,7 +39,7 @@ class AtlasResult(TypedDict):
     n_missed: int
 
 
-class ErrorAtlas(SceneRecordMetric):
+class ErrorAtlas(ObjectMetric):
     """Sorts every object that protocol ``strict`` counts as missed by its cause.
 
     A prediction is *near* an object if its centre lies within half the diagonal of the object's box, and at
@@ -94,14 +93,14 @@ class ErrorAtlas(SceneRecordMetric):
         """Sort the objects and predictions of one scene; see the base class."""
         errors = alignment_errors(predictions, targets)
         same_class = predictions.label[:, None] == targets.label
-        fits = same_class & errors.within(*DEFAULT_LIMITS)
+        fits = same_class & errors.within(*SCAN2CAD_LIMITS)
         match = match_in_order(score_order(predictions.score), fits)
         free = match < 0
         found = torch.zeros(len(targets), dtype=torch.bool).index_fill(0, match[~free], True)
-        reach = (targets.size.norm(dim=-1) / 2).clamp(min=DEFAULT_LIMITS[0])
+        reach = (targets.size.norm(dim=-1) / 2).clamp(min=SCAN2CAD_LIMITS[0])
         near = errors.translation <= reach
 
-        excess = torch.stack([error / limit for error, limit in zip(errors, DEFAULT_LIMITS, strict=True)])
+        excess = torch.stack([error / limit for error, limit in zip(errors, SCAN2CAD_LIMITS, strict=True)])
         worst, which = excess.max(dim=0)
         cause = torch.full((len(targets),), CAUSES.index("missed"))
         cause[(near & ~same_class & free[:, None]).any(dim=0)] = CAUSES.index("wrong class")
@@ -131,9 +130,7 @@ class ErrorAtlas(SceneRecordMetric):
 
     def compute(self) -> AtlasResult:
         """Return the counts over all scenes."""
-        scenes = self.scenes()
-        truths = torch.cat([torch.zeros(0, 2).double(), *(scene.truths for scene in scenes)]).long()
-        fates = torch.cat([torch.zeros(0, 2).double(), *(scene.predictions for scene in scenes)]).long()
+        truths, fates = self.truths().long(), self.predictions().long()
         per_class = {
             name: _count(truths[truths[:, 0] == label, 1], CAUSES) for label, name in enumerate(CLASSES)
         }
