@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from raytran.checkpoints.provenance import git_commit
+from raytran.checkpoints.card import git_commit
 
 
 @cache

@@ -22,7 +22,7 @@ if not torch.cuda.is_available():
     # Without a GPU Triton's kernels run in its interpreter. Triton reads this when it is first imported.
     os.environ["TRITON_INTERPRET"] = "1"
 
-from raytran.checkpoints.checkpoint import checkpoint_card
+from raytran.checkpoints.card import checkpoint_card
 from raytran.checkpoints.file import write_checkpoint
 from raytran.geometry.camera import Cameras
 from raytran.geometry.rotation import rotation_from_yaw, yaw_from_rotation

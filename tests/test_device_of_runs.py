@@ -20,7 +20,7 @@ from torch.utils.data import DataLoader
 
 from raytran.capture.camera_list import CameraList
 from raytran.capture.lens import Lens
-from raytran.checkpoints.checkpoint import checkpoint_card
+from raytran.checkpoints.card import checkpoint_card
 from raytran.checkpoints.file import read_checkpoint
 from raytran.checkpoints.runs import LAST
 from raytran.data.collate import collate_scenes

@@ -29,6 +29,6 @@ def load(checkpoint: str | Path = "default", *, trust: Iterable[str] = ()) -> Ra
         ConfigError: ``trust`` is no list of packages.
     """
     # Imported here so that ``import raytran`` stays light.
-    from raytran.checkpoints.checkpoint import load_model
+    from raytran.checkpoints.load import load_model
 
     return load_model(checkpoint, trust=trust)

@@ -8,9 +8,8 @@ import torch
 
 import raytran
 from raytran.checkpoints.earlier import upgraded, upgraded_network
-from raytran.checkpoints.file import read_checkpoint
+from raytran.checkpoints.file import read_checkpoint, shipped_weights
 from raytran.checkpoints.network import build_network
-from raytran.checkpoints.weights import shipped_weights
 
 RESNET = {
     "_target_": "raytran.backbone.resnet.ResNet18",

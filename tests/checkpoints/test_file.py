@@ -10,9 +10,7 @@ import zipfile
 import pytest
 import torch
 
-from raytran.checkpoints.content import FORMAT
-from raytran.checkpoints.file import read_checkpoint, read_newest, write_checkpoint
-from raytran.checkpoints.weights_file import write_weights
+from raytran.checkpoints.file import FORMAT, read_checkpoint, read_newest, write_checkpoint, write_weights
 from raytran.errors import CheckpointError
 
 CARD = {"format": FORMAT, "stage": "stage2", "preset": "tiny", "model": {}, "views": {}}

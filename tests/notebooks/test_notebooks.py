@@ -38,7 +38,7 @@ def kernel(script):
 @pytest.fixture(scope="module")
 def untrained(tmp_path_factory):
     """A network that has learned nothing, for a package without weights."""
-    from raytran.checkpoints.checkpoint import checkpoint_card
+    from raytran.checkpoints.card import checkpoint_card
     from raytran.checkpoints.file import write_checkpoint
     from raytran.run.entry import compose
     from raytran.run.train.build import build_model, plain

@@ -1,22 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checkpoint files: tensors and plain Python only, never half-written under their final name."""
+"""Checkpoint files: tensors and plain Python only, never half-written under their final name.
+
+There are two kinds. Training writes ``.ckpt`` files by ``torch.save``, which hold its whole state. Weights to
+give away are ``.safetensors`` files: the tensors have the names of ``RayTran.state_dict()``, so that any
+program opens them; the header's ``raytran`` is JSON, what a checkpoint says of itself without the state of
+training, and ``sha256`` is of that text and of the tensors, which safetensors itself does not check. Both are
+read as one dictionary.
+"""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import logging
 import os
 import pickle
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import torch
+from safetensors import safe_open
+from safetensors.torch import save
+from torch import Tensor
 
-from raytran.checkpoints.content import EARLIER_FORMAT, FORMAT, DamagedCheckpointError, check_content
+import raytran
 from raytran.checkpoints.earlier import upgraded
-from raytran.checkpoints.weights_file import is_weights_file, read_weights
+from raytran.checkpoints.network import without_sources
 from raytran.data.files import UNFINISHED, whole_file
-from raytran.errors import CheckpointError
+from raytran.errors import CheckpointError, ConfigError
 
 _log = logging.getLogger(__name__)
 
@@ -148,5 +161,224 @@ def _check_bytes(path: Path) -> None:
 def _damaged(path: Path) -> DamagedCheckpointError:
     return DamagedCheckpointError(
         f"cannot read {path}: the file is damaged or cut short; take another copy of it, "
-        "or delete it and train that stage again"
+        "or delete it and train that stage or export it again"
     )
+
+
+FORMAT = "raytran.checkpoint/2"
+EARLIER_FORMAT = "raytran.checkpoint/1"
+
+_REQUIRED = {"stage": str, "preset": str, "model": dict, "views": dict, "state_dict": dict}
+
+
+class DamagedCheckpointError(CheckpointError):
+    """A checkpoint that was whole once."""
+
+
+def check_content(content: Any, path: Path) -> None:
+    """Raise unless ``content`` is what this version of raytran reads.
+
+    Raises:
+        CheckpointError: it is of a newer version, of another program, or not all there.
+    """
+    found = content.get("format") if isinstance(content, dict) else None
+    family, _, version = FORMAT.partition("/")
+    if isinstance(found, str) and found.startswith(f"{family}/") and found != FORMAT:
+        newer = found.removeprefix(f"{family}/")
+        if newer.isdigit() and int(newer) > int(version):
+            raise CheckpointError(
+                f"{path} was written by a newer raytran (format {found}, this one reads {FORMAT}): "
+                "update raytran"
+            )
+    if found not in (FORMAT, EARLIER_FORMAT):
+        raise CheckpointError(f"{path} is no checkpoint of raytran: expected format {FORMAT}, got {found}")
+    for name, kind in _REQUIRED.items():
+        if not isinstance(content.get(name), kind):
+            raise CheckpointError(f"{path} is no whole checkpoint of raytran: it has no proper '{name}'")
+    if not all(
+        isinstance(name, str) and isinstance(value, Tensor) for name, value in content["state_dict"].items()
+    ):
+        raise CheckpointError(f"{path} is no checkpoint of raytran: some of its weights are no tensors")
+
+
+SUFFIX = ".safetensors"
+PREFIX = "model."
+"""Of the network's weights among those of a checkpoint."""
+
+_MAX_CARD = 1 << 20
+"""Characters of the header's JSON at most; those of the presets have some 3,000."""
+
+
+def is_weights_file(path: Path) -> bool:
+    """Return whether ``path`` is to be read as safetensors: by its name, or by its first bytes."""
+    if path.suffix == SUFFIX:
+        return True
+    with path.open("rb") as file:
+        return file.read(9)[8:] == b"{"
+
+
+def write_weights(path: Path, card: Mapping[str, Any], weights: Mapping[str, Tensor]) -> None:
+    """Write ``weights`` to ``path``, which appears whole or not at all; what was there is replaced.
+
+    Args:
+        path: the file.
+        card: what ``check_content`` asks for and anything else that is JSON, without ``state_dict``.
+        weights: the network's, named as in its ``state_dict``.
+
+    Raises:
+        CheckpointError: the disk is full or does not take the file; what was there stays.
+    """
+    # Copies, because safetensors takes no two tensors that share memory.
+    copies = {name: value.detach().cpu().contiguous().clone() for name, value in weights.items()}
+    text = json.dumps(card, ensure_ascii=False)
+    header = {"format": "pt", "raytran": text, "sha256": _digest(text, copies)}
+    # Not save_file, whose files only the owner may read.
+    write_whole(path, save(copies, metadata=header))
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Write ``content`` to ``path``, which appears whole or not at all; what was there is replaced.
+
+    Raises:
+        CheckpointError: the disk is full or does not take the file; what was there stays.
+    """
+    try:
+        with whole_file(path, durable=True) as partial:
+            partial.write_bytes(content)
+    except OSError as error:
+        raise CheckpointError(
+            f"cannot write {path} ({error.strerror}): make room there, or choose another place"
+        ) from error
+
+
+def read_weights(path: Path) -> dict[str, Any]:
+    """Return the content of a checkpoint from a file that ``write_weights`` wrote, on the CPU.
+
+    Raises:
+        DamagedCheckpointError: the file is cut short or some of its bytes have changed.
+        CheckpointError: it is another program's, or of a newer raytran.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            header = file.metadata() or {}
+            card = _parse(header.get("raytran"))
+            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
+    except Exception as error:  # a made-up file can fail anywhere in the reader
+        raise _damaged(path) from error
+    if card is None:
+        raise CheckpointError(
+            f"{path} holds no network of raytran: its header does not say how to build one; "
+            "give a file that `python -m raytran.export_model` wrote"
+        )
+    content = {**card, "state_dict": {f"{PREFIX}{name}": value for name, value in weights.items()}}
+    check_content(content, path)
+    if _digest(header["raytran"], weights) != header.get("sha256"):
+        raise _damaged(path)
+    return content
+
+
+def _parse(text: str | None) -> dict[str, Any] | None:
+    """Return the card in a header, None if there is none."""
+    if text is None or len(text) > _MAX_CARD:
+        return None
+    card = json.loads(text)
+    return card if isinstance(card, dict) else None
+
+
+def _digest(text: str, weights: Mapping[str, Tensor]) -> str:
+    """Return the SHA-256 of the card and of every tensor's name, type, shape and bytes."""
+    found = hashlib.sha256(text.encode())
+    for name in sorted(weights):
+        value = weights[name]
+        found.update(f"\n{name} {value.dtype} {tuple(value.shape)}\n".encode())
+        found.update(value.reshape(-1).view(torch.uint8).numpy().data)
+    return found.hexdigest()
+
+
+DEFAULT = "default"
+"""Stands for the package's own weights wherever a checkpoint is named."""
+
+FOLDER = Path(raytran.__file__).resolve().parent / "weights"
+"""Where these are: one file, and the page that says what it can do."""
+
+DTYPES = {"float32": torch.float32, "float16": torch.float16, "bfloat16": torch.bfloat16}
+
+_KEPT = (
+    *("format", "stage", "preset", "model", "views", "input_mask", "scores", "global_step", "warnings"),
+    *("git_commit", "versions"),
+)
+"""Of what a checkpoint says. The rest is the state of training, and settings that hold a machine's paths."""
+
+
+def checkpoint_path(checkpoint: str | Path) -> Path:
+    """Return the file that a checkpoint's name stands for.
+
+    Raises:
+        CheckpointError: it is ``default``, and the package was built without weights.
+    """
+    if str(checkpoint) != DEFAULT:
+        return Path(checkpoint)
+    found = _files()
+    if len(found) != 1:
+        what = f"{len(found)} files of weights, not one," if found else "no weights"
+        raise CheckpointError(
+            f"there are {what} in {FOLDER}, which checkpoint=default stands for: give checkpoint=FILE, "
+            "a .ckpt file that training wrote or a .safetensors file that was exported from one"
+        )
+    return found[0]
+
+
+def shipped_weights() -> Path | None:
+    """Return the package's own weights, None if it was built without."""
+    found = _files()
+    return found[0] if len(found) == 1 else None
+
+
+def _files() -> list[Path]:
+    return sorted(FOLDER.glob(f"*{SUFFIX}"))
+
+
+def export_weights(checkpoint: Mapping[str, Any], source: Path, output: Path, *, dtype: str) -> None:
+    """Write the network of a checkpoint to a safetensors file, without the state of training.
+
+    Args:
+        checkpoint: what ``read_checkpoint`` returned.
+        source: where from, for messages.
+        output: the file, which appears whole or not at all.
+        dtype: one of ``DTYPES``, for the weights; counters stay integers.
+
+    Raises:
+        ConfigError: there is no such dtype.
+        CheckpointError: some weights are beyond its range, or the file cannot be written.
+    """
+    if dtype not in DTYPES:
+        raise ConfigError(f"unknown dtype={dtype}: choose one of {', '.join(DTYPES)}")
+    weights = {
+        name.removeprefix(PREFIX): _converted(value, DTYPES[dtype], f"{name} in {source}")
+        for name, value in checkpoint["state_dict"].items()
+        if name.startswith(PREFIX)
+    }
+    write_weights(output, _card(checkpoint), weights)
+
+
+def _card(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the file says of itself."""
+    card = {name: checkpoint[name] for name in _KEPT if name in checkpoint}
+    parent = checkpoint.get("parent")
+    if isinstance(parent, Mapping):
+        card["parent"] = {name: parent.get(name) for name in ("stage", "step")}
+    data = checkpoint.get("data")
+    if isinstance(data, Mapping):
+        card["data"] = {name: data.get(name) for name in ("name", "annotation")}
+    return card | {"model": without_sources(checkpoint["model"])}
+
+
+def _converted(value: Tensor, dtype: torch.dtype, name: str) -> Tensor:
+    if not value.is_floating_point():
+        return value
+    if not value.isfinite().all():
+        raise CheckpointError(f"{name} is not finite: export a checkpoint from before the training diverged")
+    converted = value.to(dtype)
+    if not converted.isfinite().all():
+        raise CheckpointError(f"{name} is beyond the range of float16: choose dtype=bfloat16 or float32")
+    return converted

@@ -10,11 +10,15 @@ from __future__ import annotations
 import functools
 import importlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from torch import nn
 
 from raytran.errors import CheckpointError, ConfigError
+
+if TYPE_CHECKING:
+    pass
+
 
 PARTS: dict[str, str] = {
     "RayTran": "raytran.model",
@@ -207,3 +211,14 @@ def _attribute(module: str, name: str) -> Any:
 
 def _is_network(found: Any) -> bool:
     return isinstance(found, type) and issubclass(found, nn.Module)
+
+
+def without_sources(node: Any) -> Any:
+    """Return a network's config without where first weights come from: a checkpoint's take their place."""
+    if isinstance(node, Mapping):
+        is_object = "_target_" in node
+        return {
+            name: None if is_object and name == "weights" else without_sources(value)
+            for name, value in node.items()
+        }
+    return [without_sources(value) for value in node] if isinstance(node, list | tuple) else node

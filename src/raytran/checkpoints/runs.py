@@ -8,17 +8,17 @@ before it while it goes on and, once its last step is done, ``finished.json``.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 from raytran.checkpoints.earlier import STAGE_NAMES
-from raytran.checkpoints.launched import name_by_time
 from raytran.data.files import exclusive_lock, write_json
-from raytran.errors import CheckpointError, ConfigError
+from raytran.errors import CheckpointError, ConfigError, RaytranError
 
 LAST = Path("checkpoints") / "last.ckpt"
 PREVIOUS = LAST.with_name("previous.ckpt")
@@ -37,7 +37,7 @@ class Finished:
         checkpoint: path of the final checkpoint, relative to the run's folder.
         steps: optimiser steps taken.
         time: when it finished, UTC, ISO 8601.
-        data: what it was trained on, see ``KnownData``; None for a curriculum, and for runs from before this
+        data: what it was trained on, see ``DataIdentity``; None for a curriculum, and for runs from before this
             was written down.
     """
 
@@ -165,3 +165,65 @@ def run_folder(outputs: str, preset: str, experiment: str, resume: str, holds: s
             )
         return str(checkpoint.parent.parent)
     return str(parent / name_by_time())
+
+
+_WAIT = timedelta(minutes=10)
+_REFUSED = "refused: "
+
+
+def first_ranks(name: str, choose: Callable[[], str]) -> str:
+    """Return what the first of torchrun's ranks chooses; without torchrun, what this process chooses.
+
+    The ranks read clocks and folders each at its own moment: left alone, they would choose several folders.
+
+    Args:
+        name: of the choice, the same on all ranks.
+        choose: makes the choice.
+
+    Raises:
+        RaytranError: the choice cannot be made, or the first rank cannot be asked.
+    """
+    if "TORCHELASTIC_RUN_ID" not in os.environ or os.environ.get("WORLD_SIZE", "1") == "1":
+        return choose()
+    # A store that torchrun keeps for its workers, in which a restarted group finds another shelf.
+    key = f"raytran/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}/{name}"
+    from torch.distributed import TCPStore
+
+    try:
+        store = TCPStore(os.environ["MASTER_ADDR"], int(os.environ["MASTER_PORT"]), timeout=_WAIT)
+        if os.environ["RANK"] != "0":
+            choice = store.get(key).decode()
+            if choice.startswith(_REFUSED):
+                raise ConfigError(choice.removeprefix(_REFUSED))
+            return choice
+    except (RuntimeError, KeyError, ValueError) as error:
+        raise ConfigError(
+            f"this process cannot ask torchrun's first one for {name} ({error}): give output_dir= to all"
+        ) from error
+    try:
+        choice = choose()
+    except RaytranError as error:
+        store.set(key, f"{_REFUSED}{error}")
+        raise
+    store.set(key, choice)
+    return choice
+
+
+def name_by_time() -> str:
+    """Return the name of a new run's folder: the time, or in SLURM's jobs of several tasks the job's number.
+
+    Raises:
+        ConfigError: several nodes were started by hand, whose clocks differ.
+    """
+    if os.environ.get("SLURM_NTASKS", "1") != "1" and "SLURM_PROCID" in os.environ:
+        return f"job_{os.environ['SLURM_JOB_ID']}_{os.environ.get('SLURM_STEP_ID', '0')}"
+    if (
+        "NODE_RANK" in os.environ
+        and "TORCHELASTIC_RUN_ID" not in os.environ
+        and "LOCAL_RANK" not in os.environ
+    ):
+        raise ConfigError(
+            "with NODE_RANK set by hand the nodes cannot agree on a folder: "
+            "start them with torchrun or srun, or give the same output_dir= to all"
+        )
+    return datetime.now().strftime("%Y-%m-%d_%H-%M-%S")

@@ -20,8 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from raytran.checkpoints.earlier import STAGE_NAMES
-from raytran.checkpoints.launched import first_ranks
-from raytran.checkpoints.runs import run_folder
+from raytran.checkpoints.runs import first_ranks, run_folder
 from raytran.errors import ConfigError, RaytranError
 from raytran.run.config_dir import config_dir
 from raytran.run.sweep.folder import register_sweep_resolver

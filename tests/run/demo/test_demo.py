@@ -8,9 +8,8 @@ import json
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from raytran.checkpoints.checkpoint import checkpoint_card
-from raytran.checkpoints.file import write_checkpoint
-from raytran.checkpoints.weights import shipped_weights
+from raytran.checkpoints.card import checkpoint_card
+from raytran.checkpoints.file import shipped_weights, write_checkpoint
 from raytran.errors import ConfigError
 from raytran.run.demo.demo import _asked, demo
 from raytran.run.entry import compose

@@ -11,9 +11,8 @@ import torch
 from safetensors import safe_open
 
 import raytran
-from raytran.checkpoints.checkpoint import prediction_settings
-from raytran.checkpoints.file import read_checkpoint, write_checkpoint
-from raytran.checkpoints.weights_file import write_weights
+from raytran.checkpoints.file import read_checkpoint, write_checkpoint, write_weights
+from raytran.checkpoints.load import prediction_settings
 from raytran.errors import CheckpointError, ConfigError
 from raytran.export.program import example_inputs
 from raytran.run.entry import compose

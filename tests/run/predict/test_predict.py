@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from PIL import Image
 from torch import nn
 
-from raytran.checkpoints.checkpoint import PredictionSettings
+from raytran.checkpoints.load import PredictionSettings
 from raytran.errors import CheckpointError, ConfigError, DataError
 from raytran.run.predict import predict as module
 from raytran.structs import ObjectSet, ScenePrediction, Views

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from raytran.checkpoints.checkpoint import checkpoint_card
+from raytran.checkpoints.card import DataIdentity, checkpoint_card
 from raytran.checkpoints.file import write_checkpoint
-from raytran.checkpoints.known_data import KnownData
 from raytran.checkpoints.runs import LAST, write_finished
 from raytran.errors import CheckpointError, ConfigError
 from raytran.run.entry import compose
@@ -109,7 +108,7 @@ def test_what_is_remembered_of_a_parent():
 def find(outputs, experiment, *more):
     settings = ["preset=tiny", f"experiment={experiment}", "output_dir=unused", f"outputs={outputs}", *more]
     cfg = compose("train", settings)
-    found = find_parent(RunConfig.read(cfg), _stage(cfg), KnownData.of_config(plain(cfg)))
+    found = find_parent(RunConfig.read(cfg), _stage(cfg), DataIdentity.of_config(plain(cfg)))
     return None if found is None else found[0]
 
 

@@ -5,8 +5,7 @@ import re
 
 import pytest
 
-from raytran.checkpoints.checkpoint import checkpoint_card
-from raytran.checkpoints.known_data import KnownData
+from raytran.checkpoints.card import DataIdentity, checkpoint_card
 from raytran.run.entry import compose
 from raytran.run.train.build import build_model, build_module, plain
 from raytran.run.train.start_report import changed_settings, start_report
@@ -53,7 +52,7 @@ def test_a_parent_on_other_data_is_said_in_one_line():
     cfg = compose("train", [*typed, "data=scan2cad", "data.root=real"])
     module = build_module(cfg, build_model(cfg))
     parent = {"path": "a/last.ckpt", "stage": "stage1", "step": 1500, "scores": {}}
-    rooms = KnownData.of_config(plain(compose("train", [*typed, "data.root=rooms"]))).as_plain()
+    rooms = DataIdentity.of_config(plain(compose("train", [*typed, "data.root=rooms"]))).as_plain()
     line = "its parent was trained on other data, rooms in rooms; this run on scan2cad in real"
     assert line in start_report(module.stage, module.model, card(cfg, parent | {"data": rooms}))
     same = card(cfg)["data"]

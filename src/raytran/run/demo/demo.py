@@ -13,9 +13,9 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
-from raytran.checkpoints.checkpoint import load_model, prediction_settings
+from raytran.checkpoints.file import shipped_weights
+from raytran.checkpoints.load import load_model, prediction_settings
 from raytran.checkpoints.network import own_packages
-from raytran.checkpoints.weights import shipped_weights
 from raytran.data.files import SettingsRecord
 from raytran.errors import ConfigError
 from raytran.model import RayTran

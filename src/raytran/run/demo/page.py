@@ -10,7 +10,7 @@ from typing import Any
 
 from PIL import Image
 
-from raytran.checkpoints.provenance import provenance
+from raytran.checkpoints.card import provenance
 from raytran.pictures.curves import draw_curves
 from raytran.pictures.panels import contact_sheet, draw_frames, draw_masks, draw_occupancy
 from raytran.pictures.report import Picture, Report, Section, SplitScores, write_report

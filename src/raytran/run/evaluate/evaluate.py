@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import track
 from torch.utils.data import Dataset, Subset
 
-from raytran.checkpoints.checkpoint import PredictionSettings, load_model, prediction_settings
+from raytran.checkpoints.load import PredictionSettings, load_model, prediction_settings
 from raytran.checkpoints.network import trusted_packages
 from raytran.data.views import RepeatedFrames
 from raytran.errors import ConfigError

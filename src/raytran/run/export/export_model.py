@@ -12,12 +12,10 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
-from raytran.checkpoints.checkpoint import model_from, prediction_settings
-from raytran.checkpoints.file import read_checkpoint
-from raytran.checkpoints.known_data import KnownData
+from raytran.checkpoints.card import DataIdentity
+from raytran.checkpoints.file import PREFIX, SUFFIX, checkpoint_path, export_weights, read_checkpoint
+from raytran.checkpoints.load import model_from, prediction_settings
 from raytran.checkpoints.network import trusted_packages
-from raytran.checkpoints.weights import checkpoint_path, export_weights
-from raytran.checkpoints.weights_file import PREFIX, SUFFIX
 from raytran.errors import ConfigError
 from raytran.run.export.program import SUFFIX as PROGRAM_SUFFIX
 from raytran.run.export.program import export_program
@@ -71,7 +69,7 @@ def described(checkpoint: Mapping[str, Any], path: Path) -> Table:
         "stage": checkpoint["stage"],
         "steps": checkpoint.get("global_step"),
         "parent": f"{parent['stage']}, {parent['step']} steps" if parent else None,
-        "trained on": str(known) if (known := KnownData.of_checkpoint(checkpoint)) else None,
+        "trained on": str(known) if (known := DataIdentity.of_checkpoint(checkpoint)) else None,
         "weights": f"{sum(value.numel() for value in weights) / 1e6:.2f} M, {', '.join(dtypes)}",
         "images": f"{views.get('image_size')}, {views.get('predict_views')} a scene",
         "raytran": versions.get("raytran"),

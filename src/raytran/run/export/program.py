@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.export import ExportedProgram
 
-from raytran.checkpoints.weights_file import write_whole
+from raytran.checkpoints.file import write_whole
 from raytran.errors import ConfigError
 from raytran.export.program import NetworkProgram, example_inputs, export_network, export_shapes
 from raytran.model import RayTran

@@ -12,8 +12,8 @@ from hydra.utils import instantiate
 from lightning.pytorch.callbacks import LearningRateMonitor, TQDMProgressBar
 from omegaconf import DictConfig, OmegaConf
 
+from raytran.checkpoints.network import without_sources
 from raytran.checkpoints.runs import LAST
-from raytran.checkpoints.weights import without_sources
 from raytran.errors import ConfigError
 from raytran.run.train.settings import RunConfig
 from raytran.training.callbacks.health import Health

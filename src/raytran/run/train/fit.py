@@ -17,10 +17,9 @@ from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from omegaconf import DictConfig, OmegaConf
 
-from raytran.checkpoints.checkpoint import checkpoint_card, load_weights, parts_afresh
+from raytran.checkpoints.card import DataIdentity, checkpoint_card, provenance
 from raytran.checkpoints.file import read_checkpoint, read_newest
-from raytran.checkpoints.known_data import KnownData
-from raytran.checkpoints.provenance import provenance
+from raytran.checkpoints.load import load_weights, parts_afresh
 from raytran.checkpoints.runs import LAST, one_at_a_time, read_finished, write_finished
 from raytran.data.files import write_json, write_text
 from raytran.errors import CheckpointError, ConfigError
@@ -125,7 +124,7 @@ def _train(cfg: DictConfig, run: RunConfig, folder: Path) -> FitResult:
             preset=run.preset,
             experiment=run.experiment,
             steps=trainer.global_step,
-            data=KnownData.of_config(config).as_plain(),
+            data=DataIdentity.of_config(config).as_plain(),
         )
     metrics = {name: float(value) for name, value in trainer.logged_metrics.items()}
     _log.info("%s finished after %.0f s: %s", module.stage.name, seconds, folder / LAST)
@@ -184,7 +183,7 @@ def _start(cfg: DictConfig, run: RunConfig) -> _Start:
             _log.warning("continued with another setting, %s", line)
         return _Start(module, path, content.get("parent"), content.get("warnings") or ())
     stage = _stage(cfg)
-    start = find_parent(run, stage, KnownData.of_config(plain(cfg)))
+    start = find_parent(run, stage, DataIdentity.of_config(plain(cfg)))
     if start is None:
         model = build_model(cfg)
         return _Start(build_module(cfg, model), None, None, _warnings(model))

@@ -9,10 +9,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from raytran.checkpoints.file import read_checkpoint
-from raytran.checkpoints.known_data import KnownData
+from raytran.checkpoints.card import DataIdentity
+from raytran.checkpoints.file import checkpoint_path, read_checkpoint
 from raytran.checkpoints.runs import finished_runs
-from raytran.checkpoints.weights import checkpoint_path
 from raytran.errors import CheckpointError, ConfigError
 from raytran.run.train.settings import RunConfig
 from raytran.training.stage import Stage
@@ -29,7 +28,7 @@ class Parent:
         stage: name of its stage.
         step: optimiser steps it had taken.
         scores: its last validation, by name.
-        data: what it was trained on, see ``KnownData.as_plain``; None if it does not say.
+        data: what it was trained on, see ``DataIdentity.as_plain``; None if it does not say.
     """
 
     path: str
@@ -47,7 +46,7 @@ class Parent:
         """
         try:
             scores = {name: float(value) for name, value in checkpoint.get("scores", {}).items()}
-            known = KnownData.of_checkpoint(checkpoint)
+            known = DataIdentity.of_checkpoint(checkpoint)
             step, data = int(checkpoint.get("global_step", 0)), None if known is None else known.as_plain()
             return Parent(str(path), checkpoint["stage"], step, scores, data)
         except (AttributeError, TypeError, ValueError) as error:
@@ -58,7 +57,7 @@ class Parent:
         return asdict(self)
 
 
-def find_parent(run: RunConfig, stage: Stage, data: KnownData) -> tuple[Path, dict[str, Any]] | None:
+def find_parent(run: RunConfig, stage: Stage, data: DataIdentity) -> tuple[Path, dict[str, Any]] | None:
     """Return the checkpoint whose weights a new run starts from and its content, None to start from scratch.
 
     ``init_from=auto`` takes the newest finished run of the parent stage on the same data.
@@ -83,14 +82,14 @@ def find_parent(run: RunConfig, stage: Stage, data: KnownData) -> tuple[Path, di
         Path(run.outputs), preset=run.preset, stage=stage.parent, experiment=stage.parent_experiment
     ):
         content = None if mark.data else read_checkpoint(path)
-        known = KnownData.of_checkpoint({"data": mark.data} if content is None else content)
+        known = DataIdentity.of_checkpoint({"data": mark.data} if content is None else content)
         if known is None or known.is_same(data):
             return path, read_checkpoint(path) if content is None else content
         others.append(f"{path} on {known}")
     raise ConfigError(_no_parent(run, stage, data, others))
 
 
-def _no_parent(run: RunConfig, stage: Stage, data: KnownData, others: list[str]) -> str:
+def _no_parent(run: RunConfig, stage: Stage, data: DataIdentity, others: list[str]) -> str:
     first = f"`python -m raytran.train experiment={stage.parent_experiment} preset={run.preset}"
     where = f"under {Path(run.outputs).resolve()}"
     if not others:

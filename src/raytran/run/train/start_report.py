@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
-from raytran.checkpoints.known_data import KnownData
+from raytran.checkpoints.card import DataIdentity
 from raytran.checkpoints.network import own_packages
 from raytran.model import RayTran
 from raytran.training.stage import Stage
@@ -64,7 +64,7 @@ def start_report(
         ]
         at = f"{parent['stage']}, step {parent['step']}"
         lines.append(f"starts from {', '.join([at, *told])}: {parent['path']}")
-        known, data = KnownData.of_plain(parent.get("data")), KnownData.of_plain(card["data"])
+        known, data = DataIdentity.of_plain(parent.get("data")), DataIdentity.of_plain(card["data"])
         if known is not None and data is not None and not known.is_same(data):
             lines.append(f"its parent was trained on other data, {known}; this run on {data}")
     lines += [f"WARNING: {warning}" for warning in card["warnings"]]

@@ -1,70 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models out of checkpoints: the config inside says how to build them, the weights fill them."""
+"""Models out of checkpoints: the description inside says how to build the network, the weights fill it."""
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import torch
 
-from raytran.checkpoints.content import FORMAT
-from raytran.checkpoints.file import read_checkpoint
-from raytran.checkpoints.known_data import KnownData
-from raytran.checkpoints.weights import checkpoint_path
-from raytran.checkpoints.weights_file import PREFIX
+from raytran.checkpoints.card import input_mask
+from raytran.checkpoints.file import PREFIX, checkpoint_path, read_checkpoint
+from raytran.checkpoints.network import build_network
 from raytran.errors import CheckpointError
+from raytran.model import RayTran
 from raytran.ops.tracer import Attention, RayTracer
-
-if TYPE_CHECKING:
-    from raytran.model import RayTran
-
-
-def checkpoint_card(
-    *,
-    stage: str,
-    preset: str,
-    config: Mapping[str, Any],
-    parent: Mapping[str, Any] | None,
-    warnings: Sequence[str] = (),
-) -> dict[str, Any]:
-    """Return the plain Python that identifies a checkpoint.
-
-    Args:
-        stage: name of the stage.
-        preset: name of the preset.
-        config: all settings of the run, resolved; ``model`` rebuilds the network, ``views`` holds
-            ``image_size`` [H, W], ``num_views`` in training and ``predict_views``.
-        parent: the checkpoint that the fit started from, see ``Parent``, or None.
-        warnings: what anybody who uses the weights should know.
-    """
-    from raytran.checkpoints.network import with_registered_names
-    from raytran.checkpoints.provenance import git_commit, versions
-
-    return {
-        "format": FORMAT,
-        "stage": stage,
-        "preset": preset,
-        "model": with_registered_names(config["model"]),
-        "views": copy.deepcopy(config["views"]),
-        "config": copy.deepcopy(dict(config)),
-        "data": KnownData.of_config(config).as_plain(),
-        "input_mask": _input_mask(config),
-        "parent": None if parent is None else dict(parent),
-        "warnings": list(warnings),
-        "git_commit": git_commit(),
-        "versions": versions(),
-    }
-
-
-def _input_mask(config: Any) -> str | None:
-    """Return the mask that goes in as a fourth channel; checkpoints from before there were two say True."""
-    for name in ("data", "dataset", "input_mask"):
-        config = config.get(name) if isinstance(config, Mapping) else None
-    return "amodal" if config is True else config if isinstance(config, str) else None
 
 
 def load_model(
@@ -124,7 +75,7 @@ def prediction_settings(checkpoint: str | Path) -> PredictionSettings:
         num_views = int(views["predict_views"])
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path} does not say which images its network wants: it is damaged") from error
-    mask = card.get("input_mask") or _input_mask(card.get("config"))
+    mask = card.get("input_mask") or input_mask(card.get("config"))
     return PredictionSettings(card["preset"], card["stage"], (height, width), num_views, mask)
 
 
@@ -141,9 +92,6 @@ def model_from(checkpoint: Mapping[str, Any], path: Path, *, trust: Iterable[str
             weights do not fit.
         ConfigError: ``trust`` is no list of packages.
     """
-    from raytran.checkpoints.network import build_network
-    from raytran.model import RayTran
-
     with torch.device("meta"):  # the file's size, and not what it claims, decides how much memory is taken
         shell = build_network(checkpoint["model"], path, trust=trust)
     if not isinstance(shell, RayTran):

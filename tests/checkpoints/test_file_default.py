@@ -11,10 +11,9 @@ from hydra.utils import instantiate
 
 import raytran
 from raytran.checkpoints import weights as module
-from raytran.checkpoints.checkpoint import load_model, prediction_settings
-from raytran.checkpoints.file import read_checkpoint
-from raytran.checkpoints.known_data import KnownData
-from raytran.checkpoints.weights import DEFAULT, FOLDER, checkpoint_path, export_weights
+from raytran.checkpoints.card import DataIdentity
+from raytran.checkpoints.file import DEFAULT, FOLDER, checkpoint_path, export_weights, read_checkpoint
+from raytran.checkpoints.load import load_model, prediction_settings
 from raytran.errors import CheckpointError
 from raytran.run.entry import compose
 from raytran.run.train.parent import find_parent
@@ -37,7 +36,7 @@ def test_default_means_the_file_of_the_package(shipped):
     assert prediction_settings("default") == prediction_settings(shipped)
     config = compose("train", ["experiment=stage3", "preset=tiny", "init_from=default", "output_dir=x"])
     stage = instantiate(config.stage, _convert_="all")
-    found = find_parent(RunConfig.read(config), stage, KnownData(None, None))
+    found = find_parent(RunConfig.read(config), stage, DataIdentity(None, None))
     assert found is not None
     assert found[0] == shipped
 

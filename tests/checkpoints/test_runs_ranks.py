@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from torch.distributed import TCPStore
 
-from raytran.checkpoints.launched import first_ranks, name_by_time
+from raytran.checkpoints.runs import first_ranks, name_by_time
 from raytran.errors import ConfigError
 from raytran.run.entry import compose
 

@@ -8,8 +8,9 @@ import pytest
 import torch
 
 import raytran
-from raytran.checkpoints.checkpoint import checkpoint_card, load_weights, parts_afresh, prediction_settings
+from raytran.checkpoints.card import checkpoint_card
 from raytran.checkpoints.file import write_checkpoint
+from raytran.checkpoints.load import load_weights, parts_afresh, prediction_settings
 from raytran.errors import CheckpointError
 from raytran.run.entry import compose
 from raytran.run.train.build import build_model, plain

@@ -9,17 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from raytran.checkpoints.known_data import KnownData
+from raytran.checkpoints.card import DataIdentity
 from raytran.run.entry import compose
 from raytran.run.train.build import plain
 
 
-def given(root, annotation=None, name="scan2cad") -> KnownData:
-    return KnownData(name, str(root), annotation)
+def given(root, annotation=None, name="scan2cad") -> DataIdentity:
+    return DataIdentity(name, str(root), annotation)
 
 
-def known(*settings) -> KnownData:
-    return KnownData.of_config(plain(compose("train", ["preset=tiny", "output_dir=unused", *settings])))
+def known(*settings) -> DataIdentity:
+    return DataIdentity.of_config(plain(compose("train", ["preset=tiny", "output_dir=unused", *settings])))
 
 
 def annotate(root: Path, content: str) -> Path:
@@ -78,8 +78,8 @@ def test_data_of_which_nothing_is_left_are_told_by_name_and_folder():
     assert given("/data/a").is_same(given("/data/b/../a", "ab"))
     assert not given("/data/a").is_same(given("/data/b"))
     assert not given("/data/a").is_same(given("/data/a", name="mine"))
-    assert not KnownData("scan2cad", None, None).is_same(KnownData("scan2cad", None, None))
-    assert KnownData("scan2cad", None, "ab").is_same(given("/anywhere", "ab"))
+    assert not DataIdentity("scan2cad", None, None).is_same(DataIdentity("scan2cad", None, None))
+    assert DataIdentity("scan2cad", None, "ab").is_same(given("/anywhere", "ab"))
 
 
 @pytest.mark.parametrize(
@@ -92,21 +92,21 @@ def test_data_of_which_nothing_is_left_are_told_by_name_and_folder():
 )
 def test_checkpoints_from_before_configs_named_data(settings, name, text):
     config = plain(compose("train", ["preset=tiny", "output_dir=unused", *settings]))
-    assert KnownData.of_config(config).name == name
-    assert KnownData.of_checkpoint({"data": KnownData.of_config(config).as_plain()}).name == name
+    assert DataIdentity.of_config(config).name == name
+    assert DataIdentity.of_checkpoint({"data": DataIdentity.of_config(config).as_plain()}).name == name
     del config["data"]["name"]
-    old = KnownData.of_checkpoint({"config": config})
+    old = DataIdentity.of_checkpoint({"config": config})
     assert (old.name, str(old), old.annotation) == (name, text, None)
     assert old.is_same(known(*settings))
-    assert KnownData.of_checkpoint({"config": {}}) is KnownData.of_checkpoint({}) is None
+    assert DataIdentity.of_checkpoint({"config": {}}) is DataIdentity.of_checkpoint({}) is None
 
 
 def test_what_lies_there_today_says_nothing_of_an_old_checkpoint(tmp_path):
     root = annotate(tmp_path / "rooms", "[1]")
     config = plain(compose("train", ["preset=tiny", "output_dir=unused", f"data.root={root}"]))
-    assert KnownData.of_checkpoint({"config": config}).annotation is None
+    assert DataIdentity.of_checkpoint({"config": config}).annotation is None
 
 
 def test_how_it_is_typed():
     assert given("data/x").typed() == "data=scan2cad data.root=data/x"
-    assert str(KnownData(None, None)) == "unknown data"
+    assert str(DataIdentity(None, None)) == "unknown data"

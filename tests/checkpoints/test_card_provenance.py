@@ -5,7 +5,7 @@ import subprocess
 
 import torch
 
-from raytran.checkpoints.provenance import git_commit, versions
+from raytran.checkpoints.card import git_commit, versions
 
 
 def git(folder, *arguments):
@@ -38,7 +38,7 @@ def test_a_package_installed_inside_another_repository_has_no_commit(tmp_path):
 
 def test_versions_name_the_build_of_torch(monkeypatch):
     """PyPI's wheel for CUDA calls itself 2.13.0 in its metadata."""
-    monkeypatch.setattr("raytran.checkpoints.provenance.metadata.version", lambda name: "1.0")
+    monkeypatch.setattr("raytran.checkpoints.card.metadata.version", lambda name: "1.0")
     assert versions()["torch"] == torch.__version__
     assert type(versions()["torch"]) is str  # checkpoints hold plain Python
 

@@ -10,9 +10,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from raytran.checkpoints.content import FORMAT
-from raytran.checkpoints.file import read_checkpoint, write_checkpoint
-from raytran.checkpoints.weights_file import write_weights
+from raytran.checkpoints.file import FORMAT, read_checkpoint, write_checkpoint, write_weights
 from raytran.errors import CheckpointError
 
 CARD = {"format": FORMAT, "stage": "stage2", "preset": "tiny", "model": {"a": [1, 2.5, None]}, "views": {}}
