@@ -32,6 +32,7 @@ from raytran.run.entry import compose
 from raytran.run.train.build import build_model, build_module, build_trainer, plain
 from raytran.run.train.settings import RunConfig
 from raytran.structs import SHAPE_SIZE, ObjectSet, SceneBatch, Views
+from raytran.training.callbacks.stage import StageCallback
 
 WARM_UP = 5
 """Steps before anything is measured."""
@@ -96,7 +97,7 @@ def run_steps(
         module = build_module(cfg, build_model(cfg, pretrained=False))
         batch = random_batch(cameras, module.model, cfg.views.batch_size, module.stage.targets)
         card = {"stage": module.stage.name, "preset": cfg.preset, "config": plain(cfg)}
-        trainer = build_trainer(cfg, RunConfig.read(cfg), card)
+        trainer = build_trainer(cfg, RunConfig.read(cfg), card, StageCallback())
         device.adopt(trainer)
         watch = _Watch(device, warm_up, timed, clock)
         trainer.callbacks.append(watch)

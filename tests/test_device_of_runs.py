@@ -38,6 +38,7 @@ from raytran.run.predict.room import RoomViews
 from raytran.run.train.build import build_model, build_module, build_trainer, plain
 from raytran.run.train.settings import RunConfig
 from raytran.structs import SHAPE_SIZE, ObjectSet, SceneBatch, ScenePrediction, Views
+from raytran.training.callbacks.stage import StageCallback
 from raytran.training.ranks import agree
 from raytran.training.scores import SceneScores
 
@@ -154,7 +155,7 @@ def trainer_of(cfg, folder, *, steps, validate_every=None, callbacks=()):
     cfg.trainer.update({"accelerator": NAME, "strategy": NAME, "max_steps": steps})
     cfg.trainer.val_check_interval = validate_every or steps
     card = checkpoint_card(stage=cfg.stage.name, preset=cfg.preset, config=plain(cfg), parent=None)
-    trainer = build_trainer(cfg, RunConfig.read(cfg), card)
+    trainer = build_trainer(cfg, RunConfig.read(cfg), card, StageCallback())
     trainer.precision_plugin.device = NAME  # Lightning takes every accelerator but the CPU for CUDA
     trainer.callbacks.extend(callbacks)
     return trainer

@@ -53,7 +53,7 @@ def network_of(**parts):
         "_target_": "raytran.model.RayTran",
         "backbone": BACKBONE | parts.get("backbone", {}),
         "heads": {
-            "occupancy": {"_target_": "raytran.heads.dense.OccupancyHead", "channels": 16},
+            "occupancy": {"_target_": "raytran.heads.occupancy.OccupancyHead", "channels": 16},
             "objects": OBJECTS | parts.get("objects", {}),
         },
         "grid_resolution": [6, 6, 4],
@@ -120,8 +120,9 @@ def test_weights_get_their_names_of_today():
         "model.heads.objects.copies.embedding": "model.heads.objects.denoising_queries.embedding",
         "model.backbone.blocks.0.voxel_stream.key.weight": "model.backbone.blocks.0.voxel_stream.key.weight",
     }
-    content = {"model": {}, "state_dict": {name: torch.zeros(1) for name in names}}
+    content = {"stage": "joint", "model": {}, "state_dict": {name: torch.zeros(1) for name in names}}
     assert list(upgraded(content)["state_dict"]) == list(names.values())
+    assert upgraded(content)["stage"] == "stage2"
 
 
 def test_the_shipped_weights_are_of_format_1_and_load():

@@ -50,6 +50,7 @@ def test_stages_of_earlier_checkpoints_have_their_present_names(tmp_path, ending
     stage = {"name": "view", "parent": "occupancy", "other_parents": ["joint", "shape"], "terms": ["view"]}
     card = {
         **CARD,
+        "format": "raytran.checkpoint/1",
         "stage": "view",
         "parent": {"stage": "occupancy", "step": 3},
         "config": {"stage": stage, "schedule": {"batch": 2, "joint": {"steps": 5}}, "loss": {"shape": 1.0}},

@@ -10,7 +10,7 @@ import pytest
 from hydra.utils import instantiate
 
 import raytran
-from raytran.checkpoints import weights as module
+from raytran.checkpoints import file as module
 from raytran.checkpoints.card import DataIdentity
 from raytran.checkpoints.file import DEFAULT, FOLDER, checkpoint_path, export_weights, read_checkpoint
 from raytran.checkpoints.load import load_model, prediction_settings

@@ -10,7 +10,7 @@ import torch
 import raytran
 from raytran.checkpoints.card import checkpoint_card
 from raytran.checkpoints.file import write_checkpoint
-from raytran.checkpoints.load import load_weights, parts_afresh, prediction_settings
+from raytran.checkpoints.load import fresh_parts, load_weights, prediction_settings
 from raytran.errors import CheckpointError
 from raytran.run.entry import compose
 from raytran.run.train.build import build_model, plain
@@ -110,20 +110,20 @@ def test_a_part_that_begins_keeps_its_own_weights_where_the_parent_has_none(conf
     model = build_model(changed)
     fresh = {name: value.clone() for name, value in model.heads["view"].state_dict().items()}
     content = torch.load(path, weights_only=True)
-    assert parts_afresh(model, content, []) == []
+    assert fresh_parts(model, content, []) == []
     with pytest.raises(CheckpointError, match=r"heads\.view"):
         load_weights(model, content, path)
-    assert parts_afresh(model, content, ["heads.view"]) == ["heads.view"]
-    load_weights(model, content, path, afresh=["heads.view"])
+    assert fresh_parts(model, content, ["heads.view"]) == ["heads.view"]
+    load_weights(model, content, path, fresh=["heads.view"])
     assert all(torch.equal(value, model.heads["view"].state_dict()[name]) for name, value in fresh.items())
     assert torch.equal(model.backbone.unseen, parent.backbone.unseen)
     # A checkpoint that has the part gives it; one that has only some of it is damaged.
     content["state_dict"] |= {f"model.heads.view.{name}": value + 1 for name, value in fresh.items()}
-    assert parts_afresh(model, content, ["heads.view"]) == []
+    assert fresh_parts(model, content, ["heads.view"]) == []
     load_weights(model, content, path)
     assert torch.equal(model.heads["view"].ray_norm.weight, fresh["ray_norm.weight"] + 1)
     del content["state_dict"]["model.heads.view.ray_norm.weight"]
-    assert parts_afresh(model, content, ["heads.view"]) == []
+    assert fresh_parts(model, content, ["heads.view"]) == []
     with pytest.raises(CheckpointError, match="ray_norm"):
         load_weights(model, content, path)
 
@@ -144,13 +144,13 @@ def test_a_head_of_another_form_starts_at_random_if_that_of_the_parent_is_random
     first = {**torch.load(path, weights_only=True), "stage": "stage1", "parent": None}
     first["config"]["stage"] = plain(config.stage)
     assert plain(config.stage)["trainable"] == ["backbone", "heads.occupancy"]
-    assert parts_afresh(build_model(config), first, []) == []
-    assert parts_afresh(model, first, []) == ["heads.objects"]
-    load_weights(model, first, path, afresh=["heads.objects"])
+    assert fresh_parts(build_model(config), first, []) == []
+    assert fresh_parts(model, first, []) == ["heads.objects"]
+    load_weights(model, first, path, fresh=["heads.objects"])
     assert all(torch.equal(value, own[name]) for name, value in model.heads["objects"].state_dict().items())
     assert torch.equal(model.backbone.unseen, parent.backbone.unseen)
     # What was trained, here or by a parent, or what nobody knows of, is not thrown away.
     for trainable in (["heads"], ["heads.objects"], ["heads.objects.decoder"], None):
         first["config"]["stage"]["trainable"] = trainable
-        assert parts_afresh(model, first, []) == []
-    assert parts_afresh(model, torch.load(path, weights_only=True), []) == []
+        assert fresh_parts(model, first, []) == []
+    assert fresh_parts(model, torch.load(path, weights_only=True), []) == []

@@ -9,7 +9,7 @@ import torch
 
 from raytran.errors import ConfigError
 from raytran.run.train import build
-from raytran.training.callbacks.stage_setup import StageSetup
+from raytran.training.callbacks.stage import StageCallback
 
 STEPS = 15
 
@@ -28,7 +28,7 @@ def history(module, batch, precision):
         max_steps=STEPS,
         check_val_every_n_epoch=STEPS,
         gradient_clip_val=1.0,
-        callbacks=[StageSetup(), Record()],
+        callbacks=[StageCallback(), Record()],
         logger=False,
         enable_checkpointing=False,
         enable_progress_bar=False,

@@ -21,7 +21,7 @@ from raytran.run.entry import compose
 from raytran.run.train.build import build_model, build_module
 from raytran.structs import ObjectSet
 from raytran.training.callbacks.run_checks import RankAgreement
-from raytran.training.callbacks.stage_setup import StageSetup
+from raytran.training.callbacks.stage import StageCallback
 from raytran.training.ranks import (
     BatchNorm1dOverRanks,
     BatchNorm2dOverRanks,
@@ -109,7 +109,7 @@ def fit(run, batches, **settings):
         accelerator="cpu",
         max_steps=STEPS,
         gradient_clip_val=1.0,
-        callbacks=[StageSetup(), RankAgreement(), idle],
+        callbacks=[StageCallback(), RankAgreement(), idle],
         logger=False,
         enable_checkpointing=False,
         enable_progress_bar=False,

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from raytran.structs import ObjectSet
-from raytran.training.callbacks.stage_setup import StageSetup
+from raytran.training.callbacks.stage import StageCallback
 
 
 def fit(module, batch, **settings):
@@ -20,7 +20,7 @@ def fit(module, batch, **settings):
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
-        callbacks=[StageSetup()],
+        callbacks=[StageCallback()],
         **settings,
     )
     loader = torch.utils.data.DataLoader([batch], batch_size=None)

@@ -11,7 +11,7 @@ from torch.nn.modules.batchnorm import _BatchNorm
 
 from raytran.errors import ConfigError
 from raytran.model import inputs_of
-from raytran.training.callbacks.stage_setup import StageSetup
+from raytran.training.callbacks.stage import StageCallback
 
 # What RayTran §4 trains in each stage, by the beginnings of parameter names.
 TRAINED = {
@@ -37,7 +37,7 @@ def fit(module, batch, steps=2, callbacks=()):
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
-        callbacks=[StageSetup(), *callbacks],
+        callbacks=[StageCallback(), *callbacks],
     )
     loader = torch.utils.data.DataLoader([batch] * steps, batch_size=None)
     trainer.fit(module, loader, loader)
@@ -122,7 +122,7 @@ def test_frozen_parts_stay_in_evaluation_mode(batch, make_module):
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
-        callbacks=[StageSetup(), Watch()],
+        callbacks=[StageCallback(), Watch()],
     )
     loader = torch.utils.data.DataLoader([batch], batch_size=None)
     trainer.fit(module, loader, loader)

@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from raytran.checkpoints.network import with_import_paths
+from raytran.checkpoints.runs import STAGE_NAMES
 
 _FORMER_PATHS = {
     "raytran.model.RayTran": "RayTran",
@@ -26,9 +27,6 @@ _FORMER_PATHS = {
     "raytran.heads.shape.ShapeHead": "ShapeHead",
     "raytran.heads.view.ViewHead": "ViewHead",
 }
-
-STAGE_NAMES = {"occupancy": "stage1", "joint": "stage2", "shape": "stage3", "view": "novel_view"}
-"""Former name of a stage → its name."""
 
 _FORMER_WEIGHTS = (
     (r"^model\.backbone\.resnet\.", "model.backbone.image_features.encoder."),

@@ -158,10 +158,17 @@ def _check_bytes(path: Path) -> None:
         raise _damaged(path) from error
 
 
+def _damaged_weights(path: Path) -> DamagedCheckpointError:
+    return DamagedCheckpointError(
+        f"cannot read {path}: the file is damaged, cut short or no safetensors file; take another copy "
+        "of it, or export it again"
+    )
+
+
 def _damaged(path: Path) -> DamagedCheckpointError:
     return DamagedCheckpointError(
         f"cannot read {path}: the file is damaged or cut short; take another copy of it, "
-        "or delete it and train that stage or export it again"
+        "or delete it and train that stage again"
     )
 
 
@@ -264,7 +271,7 @@ def read_weights(path: Path) -> dict[str, Any]:
             card = _parse(header.get("raytran"))
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
     except Exception as error:  # a made-up file can fail anywhere in the reader
-        raise _damaged(path) from error
+        raise _damaged_weights(path) from error
     if card is None:
         raise CheckpointError(
             f"{path} holds no network of raytran: its header does not say how to build one; "
@@ -273,7 +280,7 @@ def read_weights(path: Path) -> dict[str, Any]:
     content = {**card, "state_dict": {f"{PREFIX}{name}": value for name, value in weights.items()}}
     check_content(content, path)
     if _digest(header["raytran"], weights) != header.get("sha256"):
-        raise _damaged(path)
+        raise _damaged_weights(path)
     return content
 
 

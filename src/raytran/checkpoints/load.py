@@ -108,7 +108,7 @@ def load_weights(
     path: Path,
     *,
     assign: bool = False,
-    afresh: Sequence[str] = (),
+    fresh: Sequence[str] = (),
 ) -> None:
     """Fill ``model`` with the weights of a checkpoint.
 
@@ -117,12 +117,12 @@ def load_weights(
         checkpoint: what ``read_checkpoint`` returned.
         path: where from, for messages.
         assign: take the checkpoint's tensors themselves, instead of copying into those of ``model``.
-        afresh: parts that keep the weights they have, see ``parts_afresh``.
+        fresh: parts that keep the weights they have, see ``fresh_parts``.
 
     Raises:
         CheckpointError: names or shapes differ.
     """
-    kept = tuple(f"{part}." for part in afresh)
+    kept = tuple(f"{part}." for part in fresh)
     state = {name: value for name, value in _state(checkpoint).items() if not name.startswith(kept)}
     state |= {name: value for name, value in model.state_dict().items() if name.startswith(kept)}
     try:
@@ -135,17 +135,17 @@ def load_weights(
         ) from error
 
 
-def parts_afresh(model: RayTran, checkpoint: Mapping[str, Any], begins: Sequence[str]) -> list[str]:
+def fresh_parts(model: RayTran, checkpoint: Mapping[str, Any], may_be_missing: Sequence[str]) -> list[str]:
     """Return the parts of ``model`` that a stage starts at random although it has a parent.
 
-    Those are the parts in ``begins`` of which the checkpoint has nothing, and the heads that are of another
+    Those are the parts in ``may_be_missing`` of which the checkpoint has nothing, and the heads that are of another
     form than the checkpoint's, if those are as random: it has no parent, and its stage did not train them.
     So one stage 1 does for all object heads.
 
     Args:
         model: the network.
         checkpoint: what ``read_checkpoint`` returned.
-        begins: parts that may be missing from the checkpoint.
+        may_be_missing: parts that the checkpoint need not have.
     """
     state = {name: value.shape for name, value in _state(checkpoint).items()}
     wanted = {name: value.shape for name, value in model.state_dict().items()}
@@ -153,7 +153,7 @@ def parts_afresh(model: RayTran, checkpoint: Mapping[str, Any], begins: Sequence
     def within(part: str, shapes: dict[str, torch.Size]) -> dict[str, torch.Size]:
         return {name: shape for name, shape in shapes.items() if name.startswith(f"{part}.")}
 
-    missing = [part for part in begins if not within(part, state)]
+    missing = [part for part in may_be_missing if not within(part, state)]
     heads = [f"heads.{head}" for head in model.heads]
     other = [head for head in heads if within(head, state) not in ({}, within(head, wanted))]
     return missing + [head for head in other if _is_random(head, checkpoint)]

@@ -16,9 +16,11 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from raytran.checkpoints.earlier import STAGE_NAMES
 from raytran.data.files import exclusive_lock, write_json
 from raytran.errors import CheckpointError, ConfigError, RaytranError
+
+STAGE_NAMES = {"occupancy": "stage1", "joint": "stage2", "shape": "stage3", "view": "novel_view"}
+"""Former name of a stage → its name."""
 
 LAST = Path("checkpoints") / "last.ckpt"
 PREVIOUS = LAST.with_name("previous.ckpt")
@@ -37,8 +39,7 @@ class Finished:
         checkpoint: path of the final checkpoint, relative to the run's folder.
         steps: optimiser steps taken.
         time: when it finished, UTC, ISO 8601.
-        data: what it was trained on, see ``DataIdentity``; None for a curriculum, and for runs from before this
-            was written down.
+        data: what it was trained on, see ``DataIdentity``; None for a curriculum, and for older runs.
     """
 
     stage: str

@@ -19,8 +19,7 @@ from hydra.errors import ConfigCompositionException, InstantiationException, Ove
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from raytran.checkpoints.earlier import STAGE_NAMES
-from raytran.checkpoints.runs import first_ranks, run_folder
+from raytran.checkpoints.runs import STAGE_NAMES, first_ranks, run_folder
 from raytran.errors import ConfigError, RaytranError
 from raytran.run.config_dir import config_dir
 from raytran.run.sweep.folder import register_sweep_resolver

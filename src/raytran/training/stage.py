@@ -29,7 +29,7 @@ class Stage:
         targets: what the data set must provide.
         trainable: names of the model's parts that train, e.g. ``heads.shape``; all others are frozen and in
             evaluation mode, so that batch-norm statistics stay as they are.
-        begins: names of the parts that start at random where the parent has none.
+        fresh_parts: names of the parts that start at random where the parent has none.
         new_views: frames of each scene that are held out to be rendered.
         freeze_norms: train with the batch-norm statistics that predictions use, and leave them as they are. A
             network that is trained on, with few scenes a step, then learns with what it predicts with.
@@ -45,7 +45,7 @@ class Stage:
     targets: Sequence[str]
     trainable: Sequence[str]
     other_parents: Sequence[str] = ()
-    begins: Sequence[str] = ()
+    fresh_parts: Sequence[str] = ()
     new_views: int = 0
     freeze_norms: bool = False
 

@@ -18,7 +18,7 @@ from raytran.export.program import example_inputs
 from raytran.run.entry import compose
 from raytran.run.export.export_model import export_model
 from raytran.run.plan.camera_paths import walk
-from raytran.run.train.parent import Parent
+from raytran.training.callbacks.stage import Parent
 
 from ...factories import Trained
 

@@ -7,13 +7,14 @@ from raytran.errors import ConfigError
 from raytran.run.entry import compose
 from raytran.run.train.build import build_trainer, plain
 from raytran.run.train.settings import RunConfig
+from raytran.training.callbacks.stage import StageCallback
 from raytran.training.ranks import SyncedBatchNorm
 
 
 def trainer(tmp_path, *settings):
     settings = ("preset=tiny", f"output_dir={tmp_path}", "trainer=cpu", "progress_bar=none", *settings)
     cfg = compose("train", settings)
-    return build_trainer(cfg, RunConfig.read(cfg), {"stage": "stage1", "config": plain(cfg)})
+    return build_trainer(cfg, RunConfig.read(cfg), {"stage": "stage1", "config": plain(cfg)}, StageCallback())
 
 
 def test_validations_are_counted_in_steps_however_many_batches_a_step_takes(tmp_path):

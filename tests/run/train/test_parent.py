@@ -15,8 +15,9 @@ from raytran.errors import CheckpointError, ConfigError
 from raytran.run.entry import compose
 from raytran.run.train.build import plain
 from raytran.run.train.fit import _stage
-from raytran.run.train.parent import Parent, check_parent, find_parent
+from raytran.run.train.parent import find_parent
 from raytran.run.train.settings import RunConfig
+from raytran.training.callbacks.stage import Parent, check_parent
 
 
 def stage(experiment, *more):

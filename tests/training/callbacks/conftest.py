@@ -9,7 +9,7 @@ import lightning.pytorch as pl
 import pytest
 import torch
 
-from raytran.training.callbacks.stage_setup import StageSetup
+from raytran.training.callbacks.stage import StageCallback
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def fit(batch, make_module):
             enable_checkpointing=False,
             enable_progress_bar=False,
             enable_model_summary=False,
-            callbacks=[StageSetup(), *callbacks],
+            callbacks=[StageCallback(), *callbacks],
             **{"log_every_n_steps": 1, "max_epochs": -1, **settings},
         )
         loader = torch.utils.data.DataLoader([batch] * 40, batch_size=None)

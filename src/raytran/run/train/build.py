@@ -20,7 +20,7 @@ from raytran.training.callbacks.health import Health
 from raytran.training.callbacks.last_checkpoint import LastCheckpoint
 from raytran.training.callbacks.run_checks import EffectiveBatch, RankAgreement, RepeatedFramesWarning
 from raytran.training.callbacks.scene_pictures import ScenePictures
-from raytran.training.callbacks.stage_setup import StageSetup
+from raytran.training.callbacks.stage import StageCallback
 from raytran.training.callbacks.step_progress import StepProgress
 from raytran.training.callbacks.telemetry import RunSettings, Telemetry
 from raytran.training.checkpoint_io import AtomicCheckpointIO
@@ -84,13 +84,14 @@ def choose_precision(precision: str, *, on_cpu: bool) -> str:
     return "bf16-mixed" if torch.cuda.is_bf16_supported(including_emulation=False) else "16-mixed"
 
 
-def build_trainer(cfg: DictConfig, run: RunConfig, card: dict[str, Any]) -> pl.Trainer:
+def build_trainer(cfg: DictConfig, run: RunConfig, card: dict[str, Any], stage: StageCallback) -> pl.Trainer:
     """Return Lightning's Trainer with the callbacks of every run.
 
     Args:
         cfg: the root config.
         run: the same config's switches.
         card: what each checkpoint carries.
+        stage: what the stage is.
 
     Raises:
         ConfigError: a setting has no meaning.
@@ -106,7 +107,7 @@ def build_trainer(cfg: DictConfig, run: RunConfig, card: dict[str, Any]) -> pl.T
     settings["val_check_interval"] *= settings["accumulate_grad_batches"]
     folder = Path(run.output_dir)
     callbacks: list[pl.Callback] = [
-        StageSetup(),
+        stage,
         EffectiveBatch(per_device=cfg.data.batch_size, expected=cfg.schedule.batch),
         RankAgreement(),
         RepeatedFramesWarning(),

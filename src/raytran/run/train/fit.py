@@ -6,7 +6,6 @@ from __future__ import annotations
 import logging
 import time
 import warnings
-from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,16 +18,17 @@ from omegaconf import DictConfig, OmegaConf
 
 from raytran.checkpoints.card import DataIdentity, checkpoint_card, provenance
 from raytran.checkpoints.file import read_checkpoint, read_newest
-from raytran.checkpoints.load import load_weights, parts_afresh
+from raytran.checkpoints.load import load_weights
 from raytran.checkpoints.runs import LAST, one_at_a_time, read_finished, write_finished
 from raytran.data.files import write_json, write_text
 from raytran.errors import CheckpointError, ConfigError
 from raytran.run.device import cudnn_warning, set_matmul_precision
 from raytran.run.train.build import build_data, build_model, build_module, build_trainer, plain
 from raytran.run.train.memory import explained_out_of_memory
-from raytran.run.train.parent import Parent, check_parent, find_parent
+from raytran.run.train.parent import find_parent, stages_after
 from raytran.run.train.settings import RunConfig
 from raytran.run.train.start_report import changed_settings, start_report
+from raytran.training.callbacks.stage import StageCallback
 from raytran.training.callbacks.stop_signals import StopRequestedError
 from raytran.training.reconstruction import Reconstruction
 from raytran.training.stage import Stage
@@ -91,10 +91,10 @@ def _train(cfg: DictConfig, run: RunConfig, folder: Path) -> FitResult:
         stage=module.stage.name,
         preset=run.preset,
         config=config,
-        parent=start.parent,
-        warnings=start.warnings,
+        parent=start.stage.parent,
+        warnings=start.stage.warnings,
     )
-    trainer = build_trainer(cfg, run, card)
+    trainer = build_trainer(cfg, run, card, start.stage)
     device = trainer.strategy.root_device
     set_matmul_precision(run.matmul_precision, device)
     data = build_data(cfg)
@@ -150,52 +150,57 @@ class _Start(NamedTuple):
     """Where a fit begins.
 
     Attributes:
-        module: what is trained, with its weights.
+        module: what is trained.
+        stage: what the stage is; it takes the parent's weights.
         resume_from: the checkpoint of the run to go on with, None for a new run.
-        parent: what is known of the checkpoint that the first weights came from, None if there is none.
-        warnings: what anybody who uses the weights should know of them.
     """
 
     module: Reconstruction
+    stage: StageCallback
     resume_from: Path | None
-    parent: dict[str, Any] | None
-    warnings: Sequence[str]
 
 
 def _start(cfg: DictConfig, run: RunConfig) -> _Start:
-    """Return the module with its weights, and where they are from."""
+    """Return what a resumed or a new run begins with."""
+    stage = _stage(cfg)
+    next_stages = stages_after(stage)
     found = _to_continue(run)
     if found is not None:
         path, content = found
-        if "resume" not in content:
-            raise CheckpointError(
-                f"{path} holds weights but no state of training: start a new run with init_from={path}"
-            )
-        module = build_module(cfg, build_model(cfg, pretrained=False))
-        if content["stage"] != module.stage.name:
-            raise CheckpointError(
-                f"{path} is of {content['stage']}, not {module.stage.name}: choose the experiment "
-                f"that wrote it, or start a new run from its weights with init_from={path}"
-            )
-        load_weights(module.model, content, path)
-        _log.info("continuing from step %d of %s", content.get("global_step", 0), path)
-        for line in changed_settings(content.get("config") or {}, plain(cfg)):
-            _log.warning("continued with another setting, %s", line)
-        return _Start(module, path, content.get("parent"), content.get("warnings") or ())
-    stage = _stage(cfg)
-    start = find_parent(run, stage, DataIdentity.of_config(plain(cfg)))
-    if start is None:
+        module = _resumed_module(cfg, stage, path, content)
+        callback = StageCallback(
+            parent_of_resumed=content.get("parent"),
+            warnings=content.get("warnings") or (),
+            next_stages=next_stages,
+        )
+        return _Start(module, callback, path)
+    parent = find_parent(run, stage, DataIdentity.of_config(plain(cfg)))
+    if parent is None:
         model = build_model(cfg)
-        return _Start(build_module(cfg, model), None, None, _warnings(model))
-    path, content = start
-    parent = Parent.of(path, content)
-    check_parent(parent, stage, run.check_parent)
+        callback = StageCallback(warnings=_warnings(model), next_stages=next_stages)
+        return _Start(build_module(cfg, model), callback, None)
+    # Before the network is built: a parent that is refused is told at once.
+    callback = StageCallback(parent=parent, stage=stage, check=run.check_parent, next_stages=next_stages)
+    return _Start(build_module(cfg, build_model(cfg, pretrained=False)), callback, None)
+
+
+def _resumed_module(cfg: DictConfig, stage: Stage, path: Path, content: dict[str, Any]) -> Reconstruction:
+    """Return the module with the weights of the checkpoint at ``path``, from which the run goes on."""
+    if "resume" not in content:
+        raise CheckpointError(
+            f"{path} holds weights but no state of training: start a new run with init_from={path}"
+        )
+    if content["stage"] != stage.name:
+        raise CheckpointError(
+            f"{path} is of {content['stage']}, not {stage.name}: choose the experiment "
+            f"that wrote it, or start a new run from its weights with init_from={path}"
+        )
     module = build_module(cfg, build_model(cfg, pretrained=False))
-    afresh = parts_afresh(module.model, content, stage.begins)
-    for part in afresh:
-        _log.info("%s starts at random: its parent has none that fits, and trained none", part)
-    load_weights(module.model, content, path, afresh=afresh)
-    return _Start(module, None, parent.as_plain(), content.get("warnings") or ())
+    load_weights(module.model, content, path)
+    _log.info("continuing from step %d of %s", content.get("global_step", 0), path)
+    for line in changed_settings(content.get("config") or {}, plain(cfg)):
+        _log.warning("continued with another setting, %s", line)
+    return module
 
 
 def _warnings(model: RayTran) -> list[str]:

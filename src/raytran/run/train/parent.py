@@ -1,60 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stage before: which checkpoint a new run starts from, and whether that has learned enough for it."""
+"""What a stage starts from, and which stages start from it."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
+
+from omegaconf import OmegaConf
 
 from raytran.checkpoints.card import DataIdentity
 from raytran.checkpoints.file import checkpoint_path, read_checkpoint
 from raytran.checkpoints.runs import finished_runs
-from raytran.errors import CheckpointError, ConfigError
+from raytran.errors import ConfigError
+from raytran.run.config_dir import config_dir
 from raytran.run.train.settings import RunConfig
 from raytran.training.stage import Stage
-
-_log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Parent:
-    """Where the first weights of a run come from.
-
-    Attributes:
-        path: of the checkpoint.
-        stage: name of its stage.
-        step: optimiser steps it had taken.
-        scores: its last validation, by name.
-        data: what it was trained on, see ``DataIdentity.as_plain``; None if it does not say.
-    """
-
-    path: str
-    stage: str
-    step: int
-    scores: dict[str, float]
-    data: dict[str, Any] | None = None
-
-    @staticmethod
-    def of(path: Path, checkpoint: Mapping[str, Any]) -> Parent:
-        """Return what is to be remembered of a parent.
-
-        Raises:
-            CheckpointError: the file says nothing sensible.
-        """
-        try:
-            scores = {name: float(value) for name, value in checkpoint.get("scores", {}).items()}
-            known = DataIdentity.of_checkpoint(checkpoint)
-            step, data = int(checkpoint.get("global_step", 0)), None if known is None else known.as_plain()
-            return Parent(str(path), checkpoint["stage"], step, scores, data)
-        except (AttributeError, TypeError, ValueError) as error:
-            raise CheckpointError(f"{path} says odd things of itself ({error}): it is damaged") from error
-
-    def as_plain(self) -> dict[str, Any]:
-        """Return plain Python, to be written into a checkpoint."""
-        return asdict(self)
 
 
 def find_parent(run: RunConfig, stage: Stage, data: DataIdentity) -> tuple[Path, dict[str, Any]] | None:
@@ -106,43 +66,13 @@ def _no_parent(run: RunConfig, stage: Stage, data: DataIdentity, others: list[st
     )
 
 
-def check_parent(parent: Parent, stage: Stage, check: str) -> None:
-    """Raise unless ``parent`` is of a stage that ``stage`` builds on, or of its own, and knows its task.
-
-    Args:
-        parent: the checkpoint to start from.
-        stage: the stage to train.
-        check: ``scores``, or ``stage`` to leave out its task, or ``none`` to warn only.
-
-    Raises:
-        CheckpointError: the parent is of another stage or its validation score is too low.
-    """
-    if stage.parent is None or parent.stage in (stage.name, *stage.other_parents):
-        return
-    again = f"train experiment={stage.parent_experiment}"
-    if parent.stage != stage.parent:
-        objection = f"{parent.path} is of {parent.stage}, but {stage.name} builds on {stage.parent}"
-        if check == "none":
-            _log.warning("%s", objection)
-            return
-        raise CheckpointError(f"{objection}: {again} first, or force it with check_parent=none")
-    unlearned = _unlearned(parent, stage) if check == "scores" else None
-    if unlearned is not None:
-        raise CheckpointError(
-            f"{parent.path} {unlearned}: {again} longer, or force it with check_parent=stage"
-        )
-
-
-def _unlearned(parent: Parent, stage: Stage) -> str | None:
-    """Say why ``parent`` has not learned its task, None if it has."""
-    if stage.parent_score is None:
-        return None
-    score = parent.scores.get(f"val/{stage.parent_score}")
-    if score is None:
-        return f"has never been validated, so that its {stage.parent_score} is unknown"
-    if not score > stage.parent_minimum:
-        return (
-            f"has not learned {stage.parent_score.partition('/')[0]}: its validation {stage.parent_score} "
-            f"is {score:.3g} and must exceed {stage.parent_minimum:g} (stage.parent_minimum)"
-        )
-    return None
+def stages_after(stage: Stage) -> list[Stage]:
+    """Return the stages of ``conf/stage`` that build on ``stage``, as they are without any override."""
+    after = []
+    for path in sorted((config_dir() / "stage").glob("*.yaml")):
+        content: Any = OmegaConf.to_container(OmegaConf.load(path))
+        # A stage that brings a head of its own sets more than the stage.
+        settings = content.get("stage", content)
+        if settings.get("parent") == stage.name:
+            after.append(Stage(**{name: settings[name] for name in settings if name != "_target_"}))
+    return after
