@@ -94,14 +94,66 @@ def test_a_lens_that_distorts_is_resampled(walk):
     assert scan.intrinsics[0, 0].item() > 50
 
 
-def test_fisheyes_are_refused(walk):
-    model = {"model": "OPENCV_FISHEYE", "parameters": [50, 50, 32, 24, 0.1, 0, 0, 0]}
-    write_colmap(walk, walk.folder / "sparse" / "0", binary=True, **model)
-    with pytest.raises(DataError, match=r"OPENCV_FISHEYE, a fisheye.*image_undistorter"):
-        read_colmap(walk.folder)
-    write_colmap(walk, walk.folder / "text", binary=False, **model)
-    with pytest.raises(DataError, match=r"OPENCV_FISHEYE, a fisheye.*image_undistorter"):
-        read_colmap(walk.folder / "text")
+@pytest.mark.parametrize("binary", [True, False])
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("OPENCV_FISHEYE", [50, 50, 32, 24, 0.1, 0, 0, 0]),
+        ("SIMPLE_RADIAL_FISHEYE", [50, 32, 24, 0.1]),
+        ("RAD_TAN_THIN_PRISM_FISHEYE", [50, 50, 32, 24, 0.1, *[0.001] * 11]),
+    ],
+)
+def test_fisheyes_are_resampled(walk, binary, model, params):
+    write_colmap(walk, walk.folder / "sparse" / "0", binary=binary, model=model, parameters=params)
+    scan = from_files(read_colmap(walk.folder))
+    assert scan.color_bytes(0) is None
+    assert scan.read_color(5)[24, 32].tolist() == [100] * 3
+    # A fisheye of the same focal length sees more than a pinhole, so no corner is empty without zooming.
+    assert scan.intrinsics[0, 0].item() == 50
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_the_cameras_of_a_rig_get_poses_of_their_own(walk, binary, tmp_path):
+    """Four frames of a rig with two cameras, as pycolmap writes it: the second looks to the side."""
+    pycolmap = pytest.importorskip("pycolmap")
+    rig = pycolmap.Rig(rig_id=1)
+    model = pycolmap.Reconstruction()
+    for number in (1, 2):
+        camera = pycolmap.Camera(
+            camera_id=number, model="PINHOLE", width=64, height=48, params=list(walk.camera)
+        )
+        model.add_camera(camera)
+    side_from_front = np.c_[np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]), [0.1, 0.0, 0.05]]
+    rig.add_ref_sensor(model.cameras[1].sensor_id)
+    rig.add_sensor(model.cameras[2].sensor_id, pycolmap.Rigid3d(side_from_front))
+    model.add_rig(rig)
+    expected = {}
+    (walk.folder / "images" / "side").mkdir()
+    for n in range(4):
+        frame = pycolmap.Frame(frame_id=n + 1, rig_id=1)
+        names = (f"{n}.png", f"side/{n}.png")
+        images = [
+            pycolmap.Image(image_id=2 * n + k, name=names[k], camera_id=k + 1, frame_id=n + 1) for k in (0, 1)
+        ]
+        for image in images:
+            frame.add_data_id(image.data_id)
+        front = np.linalg.inv(walk.poses[n])
+        frame.rig_from_world = pycolmap.Rigid3d(front[:3])
+        model.add_frame(frame)
+        for image in images:
+            model.add_image(image)
+        model.register_frame(n + 1)
+        shutil.copy(walk.folder / "images" / names[0], walk.folder / "images" / names[1])
+        expected[f"{n}"] = walk.poses[n]
+        expected[f"side_{n}"] = np.linalg.inv(np.vstack([side_from_front, [0, 0, 0, 1]]) @ front)
+    folder = walk.folder / "sparse" / "0"
+    folder.mkdir(parents=True)
+    (model.write_binary if binary else model.write_text)(str(folder))
+    assert (folder / f"rigs.{'bin' if binary else 'txt'}").is_file()
+    scan = from_files(read_colmap(walk.folder))
+    assert set(scan.frame_id) == set(expected)
+    for name, pose in zip(scan.frame_id, scan.world_from_camera.numpy(), strict=True):
+        np.testing.assert_allclose(pose, expected[name], atol=1e-9)
 
 
 def test_every_cut_of_a_binary_file_is_one_sentence(walk):

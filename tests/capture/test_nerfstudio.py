@@ -73,6 +73,14 @@ def test_distortion_is_read_unless_the_model_has_none(walk):
     assert opened(walk, k1=0.2, camera_model="PINHOLE").color_bytes(0) is not None
 
 
+@pytest.mark.parametrize("changes", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
+def test_a_fisheye_is_resampled(walk, changes):
+    scan = opened(walk, k1=0.1, k2=0.01, **changes)
+    assert (scan.lens[0].model, scan.lens[0].distortion) == ("OPENCV_FISHEYE", (0.1, 0.01, 0.0, 0.0))
+    assert scan.color_bytes(0) is None
+    assert scan.read_color(7)[24, 32].tolist() == [140] * 3
+
+
 def test_images_without_poses_and_poses_without_images_are_counted(walk):
     frames = transforms(walk)["frames"][1:]
     (walk.folder / "images" / "4.png").unlink()
@@ -96,9 +104,8 @@ def test_a_pose_that_is_none_is_dropped(walk):
         ({"frames": [{"file_path": "images/0.png"}]}, "frame 0 of .* has no transform_matrix"),
         ({"fl_x": "wide"}, "has fl_x = 'wide' where a number is needed"),
         ({"fl_x": float("inf")}, "where a number is needed"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE, which is not read: undistort"),
+        ({"camera_model": "OPENCV_FISHEYE", "k1": -3}, "the distortion of frame 0 .* folds the image"),
         ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR, which is not read: undistort"),
-        ({"is_fisheye": True}, "camera model fisheye, which is not read"),
         ({"w": 100_000, "h": 100_000}, "100000x100000"),
         ({"w": 48, "h": 64, "cx": 25, "cy": 31}, "is 64x48 and its intrinsics .* for 48x64, turned by 90°"),
         ({"applied_transform": [[0, 0, 0, 0]] * 3}, "applied_transform .* cannot be undone"),

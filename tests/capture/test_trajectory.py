@@ -109,7 +109,7 @@ def test_intrinsics_in_every_form(tmp_path):
         assert lens.is_pinhole
     path.write_text("50 51 31 25 -0.1 0.02 0.003 0.004 0.005")
     lens = read_camera(path, (48, 64))
-    assert (lens.radial, lens.tangential) == ((-0.1, 0.02, 0.005), (0.003, 0.004))
+    assert (lens.model, lens.distortion) == ("FULL_OPENCV", (-0.1, 0.02, 0.003, 0.004, 0.005, 0, 0, 0))
     path.write_text("50 51")
     with pytest.raises(DataError, match="holds no intrinsics: write `fx fy cx cy` of the stored images"):
         read_camera(path, (48, 64))

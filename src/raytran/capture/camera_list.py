@@ -114,8 +114,7 @@ def _nerfstudio(
     undo = undo_applied(content, path)
     lenses, poses = [], []
     for one, place in zip(facts, places, strict=True):
-        lens = frame_lens(one, None, place)
-        lenses.append(Lens(lens.size, lens.focal, lens.center))
+        lenses.append(frame_lens(one, None, place, distorted=False))
         pose = frame_pose(one, undo, place)
         pose[:3, :3] = pose[:3, :3] @ OPENGL
         poses.append(pose)

@@ -25,14 +25,15 @@ from raytran.capture.imported import (
     unposed_images,
 )
 from raytran.capture.json_file import number, numbers, read_object
-from raytran.capture.lens import Lens, check_lens
+from raytran.capture.lens import Lens, check_lens, opencv_lens
 from raytran.data.images import stored_size
 from raytran.errors import DataError
 
 NAMES = ("transforms.json", "transforms_train.json")
 
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
-_DISTORTED = ("OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+_PERSPECTIVE = ("OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")
+_FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 
 def find_transforms(path: Path) -> Path | None:
@@ -49,8 +50,8 @@ def read_nerfstudio(path: Path) -> Source:
         path: the file or its folder.
 
     Raises:
-        DataError: it is missing, damaged, lists no frames, names images outside its folder, or is of a
-            fisheye lens.
+        ConfigError: its lens distorts and pycolmap is not installed.
+        DataError: it is missing, damaged, lists no frames, or names images outside its folder.
     """
     listed = find_transforms(path)
     if listed is None:
@@ -117,22 +118,31 @@ def frame_pose(facts: Mapping[str, Any], undo: NDArray[np.float64], where: str) 
     return pose
 
 
-def frame_lens(facts: Mapping[str, Any], size: tuple[int, int] | None, where: str) -> Lens:
+def frame_lens(
+    facts: Mapping[str, Any], size: tuple[int, int] | None, where: str, *, distorted: bool = True
+) -> Lens:
     """Return the lens of a frame.
 
     Args:
         facts: of the frame and of all frames.
         size: ``(H, W)`` of its image, if the facts do not say.
         where: name of the frame in messages.
+        distorted: False leaves the distortion of a perspective lens out.
 
     Raises:
-        DataError: a number is missing or odd, or the lens is a fisheye.
+        ConfigError: the lens distorts and pycolmap is not installed.
+        DataError: a number is missing or odd, or the camera model is unknown.
     """
     model = str(facts.get("camera_model", "OPENCV")).upper()
-    if facts.get("is_fisheye") or model not in (*_PINHOLES, *_DISTORTED):
+    is_fisheye = bool(facts.get("is_fisheye")) or model in _FISHEYES
+    if not is_fisheye and model not in (*_PINHOLES, *_PERSPECTIVE):
         raise DataError(
-            f"{where} has the camera model {model if not facts.get('is_fisheye') else 'fisheye'}, which is "
-            "not read: undistort the images to a pinhole camera and export them again"
+            f"{where} has the camera model {model}, which is not read: undistort the images to a pinhole "
+            "camera and export them again"
+        )
+    if is_fisheye and not distorted:
+        raise DataError(
+            f"{where} is a fisheye, and only pinhole cameras are rendered: write camera_model PINHOLE"
         )
     if size is None or ("w" in facts and "h" in facts):
         size = int(number(facts, "h", where)), int(number(facts, "w", where))
@@ -141,11 +151,13 @@ def frame_lens(facts: Mapping[str, Any], size: tuple[int, int] | None, where: st
     fx = _focal(facts, "fl_x", "camera_angle_x", size[1], where)
     fy = _focal(facts, "fl_y", "camera_angle_y", size[0], where) if _has_y(facts) else fx
     center = number(facts, "cx", where, size[1] / 2), number(facts, "cy", where, size[0] / 2)
-    if model in _PINHOLES:
+    if model in _PINHOLES or not distorted:
         return check_lens(Lens(size, (fx, fy), center), where)
-    radial = tuple(number(facts, key, where, 0.0) for key in ("k1", "k2", "k3", "k4"))
+    k1, k2, k3, k4 = (number(facts, key, where, 0.0) for key in ("k1", "k2", "k3", "k4"))
+    if is_fisheye:
+        return check_lens(Lens(size, (fx, fy), center, "OPENCV_FISHEYE", (k1, k2, k3, k4)), where)
     tangential = number(facts, "p1", where, 0.0), number(facts, "p2", where, 0.0)
-    return check_lens(Lens(size, (fx, fy), center, radial, tangential=tangential), where)
+    return opencv_lens(size, (fx, fy), center, (k1, k2, k3, k4), tangential, where)
 
 
 def _has_y(facts: Mapping[str, Any]) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from raytran.capture.lens import Lens, check_lens
+from raytran.capture.lens import Lens, check_lens, opencv_lens
 from raytran.errors import DataError
 
 TRACK_NAMES = (
@@ -157,14 +157,13 @@ def read_camera(path: Path, image_size: tuple[int, int]) -> Lens:
     """
     values = read_table(path)
     if values.shape in ((3, 3), (4, 4)):
-        lens = Lens(image_size, (values[0, 0], values[1, 1]), (values[0, 2], values[1, 2]))
-    elif values.size in (4, 8, 9):
-        fx, fy, cx, cy, *rest = values.ravel().tolist()
-        k1, k2, p1, p2, k3 = (*rest, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
-        lens = Lens(image_size, (fx, fy), (cx, cy), radial=(k1, k2, k3), tangential=(p1, p2))
-    else:
+        focal, center = (values[0, 0], values[1, 1]), (values[0, 2], values[1, 2])
+        return check_lens(Lens(image_size, focal, center), str(path))
+    if values.size not in (4, 8, 9):
         raise DataError(
             f"{path} holds no intrinsics: write `fx fy cx cy` of the stored images, or with distortion "
             "`fx fy cx cy k1 k2 p1 p2`"
         )
-    return check_lens(lens, str(path))
+    fx, fy, cx, cy, *distortion = values.ravel().tolist()
+    k1, k2, p1, p2, k3 = (*distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
+    return opencv_lens(image_size, (fx, fy), (cx, cy), (k1, k2, k3, 0.0), (p1, p2), str(path))
