@@ -11,6 +11,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+SCAN = "scene0000_00"
+"""The scan in the room of the tests."""
+
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 MODEL_NUMBERS = {
     "PINHOLE": 1,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from raytran.capture.colmap import find_model, read_colmap
-from raytran.capture.imported import from_files
+from raytran.capture.recording import open_recording
 from raytran.errors import DataError
 
 from .forms import write_colmap
@@ -19,7 +19,7 @@ from .forms import write_colmap
 @pytest.mark.parametrize("binary", [True, False])
 def test_cameras_and_images_are_those_that_were_written(walk, binary):
     write_colmap(walk, walk.folder / "sparse" / "0", binary=binary)
-    scan = from_files(read_colmap(walk.folder))
+    scan = open_recording(read_colmap(walk.folder))
     assert scan.scene_id == "walk"
     assert scan.frame_id == tuple(str(n) for n in range(12))
     np.testing.assert_allclose(scan.world_from_camera.numpy(), walk.poses, atol=1e-12)
@@ -43,10 +43,10 @@ def test_pycolmap_reads_the_same(walk, binary, tmp_path):
     (tmp_path / "again").mkdir()
     (model.write_text if binary else model.write_binary)(str(tmp_path / "again"))
     for place in (folder, tmp_path / "again"):
-        shots = {shot.image.name: shot for shot in read_colmap(place).shots}
-        assert len(shots) == len(model.images) == 12
+        frames = {frame.image.name: frame for frame in read_colmap(place).frames}
+        assert len(frames) == len(model.images) == 12
         for image in model.images.values():
-            inverse = np.linalg.inv(shots[image.name].world_from_camera)[:3]
+            inverse = np.linalg.inv(frames[image.name].world_from_camera)[:3]
             np.testing.assert_allclose(inverse, image.cam_from_world().matrix(), atol=1e-9)
 
 
@@ -55,7 +55,7 @@ def test_the_model_is_found_where_tools_put_it(walk):
         write_colmap(walk, walk.folder / place, binary=True)
         assert find_model(walk.folder) == walk.folder / place
         # The folder of the model itself may be given: images are found above it.
-        assert len(from_files(read_colmap(walk.folder / place))) == 12
+        assert len(open_recording(read_colmap(walk.folder / place))) == 12
         shutil.rmtree(walk.folder / place.split("/")[0])
     assert find_model(walk.folder) is None
 
@@ -64,14 +64,14 @@ def test_of_several_models_the_largest_is_read(walk):
     few = replace(walk, names=walk.names[:3], poses=walk.poses[:3])
     write_colmap(few, walk.folder / "sparse" / "0", binary=True)
     write_colmap(walk, walk.folder / "sparse" / "1", binary=True)
-    assert len(read_colmap(walk.folder).shots) == 12
+    assert len(read_colmap(walk.folder).frames) == 12
 
 
 def test_images_without_poses_and_poses_without_images_are_counted(walk):
     write_colmap(walk, walk.folder / "sparse" / "0", binary=True)
     (walk.folder / "images" / "3.png").unlink()
     shutil.copy(walk.folder / "images" / "4.png", walk.folder / "images" / "99.png")
-    scan = from_files(read_colmap(walk.folder))
+    scan = open_recording(read_colmap(walk.folder))
     assert scan.dropped == {"3": "no image", "99": "no pose"}
     assert len(scan) == 11
 
@@ -79,7 +79,7 @@ def test_images_without_poses_and_poses_without_images_are_counted(walk):
 def test_smaller_copies_of_the_images_scale_the_lens(walk):
     large = replace(walk, image_size=(96, 128), camera=tuple(2 * value for value in walk.camera))
     write_colmap(large, walk.folder / "sparse" / "0", binary=False)
-    scan = from_files(read_colmap(walk.folder))
+    scan = open_recording(read_colmap(walk.folder))
     assert scan.image_size == (48, 64)
     assert scan.intrinsics[0, 0].item() == pytest.approx(walk.camera[0])
 
@@ -88,7 +88,7 @@ def test_a_lens_that_distorts_is_resampled(walk):
     write_colmap(
         walk, walk.folder / "sparse" / "0", binary=True, model="SIMPLE_RADIAL", parameters=[50, 31, 25, 0.2]
     )
-    scan = from_files(read_colmap(walk.folder))
+    scan = open_recording(read_colmap(walk.folder))
     assert scan.color_bytes(0) is None
     assert scan.read_color(5, (24, 32)).shape == (24, 32, 3)
     assert scan.intrinsics[0, 0].item() > 50
@@ -105,7 +105,7 @@ def test_a_lens_that_distorts_is_resampled(walk):
 )
 def test_fisheyes_are_resampled(walk, binary, model, params):
     write_colmap(walk, walk.folder / "sparse" / "0", binary=binary, model=model, parameters=params)
-    scan = from_files(read_colmap(walk.folder))
+    scan = open_recording(read_colmap(walk.folder))
     assert scan.color_bytes(0) is None
     assert scan.read_color(5)[24, 32].tolist() == [100] * 3
     # A fisheye of the same focal length sees more than a pinhole, so no corner is empty without zooming.
@@ -150,7 +150,7 @@ def test_the_cameras_of_a_rig_get_poses_of_their_own(walk, binary, tmp_path):
     folder.mkdir(parents=True)
     (model.write_binary if binary else model.write_text)(str(folder))
     assert (folder / f"rigs.{'bin' if binary else 'txt'}").is_file()
-    scan = from_files(read_colmap(walk.folder))
+    scan = open_recording(read_colmap(walk.folder))
     assert set(scan.frame_id) == set(expected)
     for name, pose in zip(scan.frame_id, scan.world_from_camera.numpy(), strict=True):
         np.testing.assert_allclose(pose, expected[name], atol=1e-9)
@@ -200,7 +200,7 @@ def test_no_model_and_no_images(walk):
     write_colmap(walk, walk.folder / "sparse" / "0", binary=True)
     shutil.rmtree(walk.folder / "images")
     with pytest.raises(DataError, match=r"none of the 12 frames .*\(12 no image\): check that its images"):
-        from_files(read_colmap(walk.folder))
+        open_recording(read_colmap(walk.folder))
 
 
 def test_images_of_another_shape_are_refused(walk):
@@ -210,4 +210,4 @@ def test_images_of_another_shape_are_refused(walk):
     with pytest.raises(
         DataError, match=r"image 0 is 64x48 and its intrinsics .* for 48x64, turned by 90°: give"
     ):
-        from_files(read_colmap(walk.folder))
+        open_recording(read_colmap(walk.folder))

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from raytran.capture.imported import from_files
 from raytran.capture.nerfstudio import read_nerfstudio
+from raytran.capture.recording import open_recording
 from raytran.errors import DataError
 
 from .forms import OPENGL, transforms, write_transforms
@@ -22,7 +22,7 @@ from .forms import OPENGL, transforms, write_transforms
 def opened(walk, **changes):
     source = read_nerfstudio(write_transforms(walk, **changes))
     assert source.axes == "opengl"
-    return from_files(source)
+    return open_recording(source)
 
 
 def test_poses_intrinsics_and_images_are_those_that_were_written(walk):
@@ -63,7 +63,7 @@ def test_an_angle_of_view_will_do_and_names_without_ending(walk):
         frame["file_path"] = "./" + frame["file_path"].removesuffix(".png")
     angle = 2 * math.atan(64 / 2 / 50)
     (walk.folder / "transforms.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
-    scan = from_files(read_nerfstudio(walk.folder))
+    scan = open_recording(read_nerfstudio(walk.folder))
     assert scan.intrinsics.numpy()[[0, 1, 0, 1], [0, 1, 2, 2]] == pytest.approx([50, 50, 32, 24])
     assert len(scan) == 12
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from raytran.capture.open import FORMATS, open_scene
-from raytran.capture.orient import WorldSettings
+from raytran.capture.orientation import WorldSettings
 from raytran.errors import ConfigError, DataError
 
 from ..scan_forms import write_form

@@ -21,8 +21,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from raytran.capture.imported import Shot, Source, frame_name, path_inside, unposed_images
 from raytran.capture.lens import Lens, colmap_lens, lens_model
+from raytran.capture.recording import Frame, Recording, frame_name, path_inside, unposed_images
 from raytran.errors import DataError
 from raytran.geometry.rotation import matrix_from_quaternion
 
@@ -63,7 +63,7 @@ def find_model(path: Path) -> Path | None:
     return None
 
 
-def read_colmap(path: Path) -> Source:
+def read_colmap(path: Path) -> Recording:
     """Read a COLMAP model.
 
     Args:
@@ -94,13 +94,13 @@ def read_colmap(path: Path) -> Source:
             "does not have: export the model again"
         )
     folder = _image_folder(path, model, [image.name for image in images])
-    shots = tuple(
-        Shot(frame_name(image.name), path_inside(folder, image.name, listed), pose, lenses[image.camera])
+    frames = tuple(
+        Frame(frame_name(image.name), path_inside(folder, image.name, listed), pose, lenses[image.camera])
         for image, pose in zip(images, _world_from_camera(images), strict=True)
     )
     ancestors = (path.resolve(), *path.resolve().parents)
     scene = next(folder for folder in ancestors if folder.name not in ("0", "sparse"))
-    return Source(path=listed, scene_id=scene.name, shots=shots, dropped=unposed_images(shots, folder))
+    return Recording(path=listed, scene_id=scene.name, frames=frames, dropped=unposed_images(frames, folder))
 
 
 def _file_ending(folder: Path) -> str | None:
