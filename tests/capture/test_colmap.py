@@ -4,14 +4,16 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from raytran.capture.colmap import find_model, read_colmap
+from raytran.capture.lens import load_pycolmap
 from raytran.capture.recording import open_recording
-from raytran.errors import DataError
+from raytran.errors import ConfigError, DataError
 
 from .forms import write_colmap
 
@@ -170,6 +172,44 @@ def test_every_cut_of_a_binary_file_is_one_sentence(walk):
     (folder / "images.bin").write_bytes(b"\xff" * 7 + whole[7:])
     with pytest.raises(DataError, match="ends early"):
         read_colmap(walk.folder)
+
+
+def test_random_damage_is_one_sentence_or_another_model(walk):
+    rng = np.random.default_rng(0)
+    folder = walk.folder / "sparse" / "0"
+    lens = {"model": "OPENCV_FISHEYE", "parameters": [50, 50, 32, 24, 0.01, 0.01, 0.01, 0.01]}
+    refused: list[str] = []
+    for case in range(60):
+        write_colmap(walk, folder, binary=case % 3 > 0, **lens)
+        path = sorted(folder.iterdir())[int(rng.integers(2))]
+        content = bytearray(path.read_bytes())
+        for at in rng.integers(len(content), size=4):
+            content[at] = rng.integers(256)
+        path.write_bytes(content)
+        try:
+            read_colmap(walk.folder)
+        except DataError as error:
+            refused.append(str(error))
+        shutil.rmtree(folder)
+    assert len(refused) > 20
+    assert not any("\n" in message for message in refused)
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_pinholes_are_read_without_pycolmap_and_others_ask_for_it(walk, binary, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    load_pycolmap.cache_clear()
+    try:
+        write_colmap(walk, walk.folder / "sparse" / "0", binary=binary)
+        assert len(open_recording(read_colmap(walk.folder))) == 12
+        lens = {"model": "SIMPLE_RADIAL", "parameters": [50, 31, 25, 0.2]}
+        write_colmap(walk, walk.folder / "other", binary=binary, **lens)
+        with pytest.raises(
+            ConfigError, match=r"pycolmap, which is not installed: pip install 'raytran\[colmap\]'$"
+        ):
+            read_colmap(walk.folder / "other")
+    finally:
+        load_pycolmap.cache_clear()
 
 
 @pytest.mark.parametrize(
