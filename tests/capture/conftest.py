@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from PIL import Image
 
 from raytran.capture.doctor.matches import match_frames
 from raytran.capture.frames import RawScan, read_grey
+from raytran.capture.lens import _unit_camera, load_pycolmap
 from raytran.data.scannet.scan import read_scan
 
 from .forms import SCAN, Walk
@@ -35,6 +37,16 @@ def walk(tmp_path: Path) -> Walk:
     return Walk(
         images.parent, tuple(f"{n}.png" for n in range(12)), poses, (48, 64), (50.0, 51.0, 31.0, 25.0)
     )
+
+
+@pytest.fixture
+def without_pycolmap(monkeypatch):
+    """An installation without the extra ``colmap``."""
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    load_pycolmap.cache_clear()
+    _unit_camera.cache_clear()
+    yield
+    load_pycolmap.cache_clear()
 
 
 @pytest.fixture(scope="session")

@@ -4,14 +4,12 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from raytran.capture.colmap import find_model, read_colmap
-from raytran.capture.lens import load_pycolmap
 from raytran.capture.recording import open_recording
 from raytran.errors import ConfigError, DataError
 
@@ -196,20 +194,14 @@ def test_random_damage_is_one_sentence_or_another_model(walk):
 
 
 @pytest.mark.parametrize("binary", [True, False])
-def test_pinholes_are_read_without_pycolmap_and_others_ask_for_it(walk, binary, monkeypatch):
-    monkeypatch.setitem(sys.modules, "pycolmap", None)
-    load_pycolmap.cache_clear()
-    try:
-        write_colmap(walk, walk.folder / "sparse" / "0", binary=binary)
-        assert len(open_recording(read_colmap(walk.folder))) == 12
-        lens = {"model": "SIMPLE_RADIAL", "parameters": [50, 31, 25, 0.2]}
-        write_colmap(walk, walk.folder / "other", binary=binary, **lens)
-        with pytest.raises(
-            ConfigError, match=r"pycolmap, which is not installed: pip install 'raytran\[colmap\]'$"
-        ):
-            read_colmap(walk.folder / "other")
-    finally:
-        load_pycolmap.cache_clear()
+@pytest.mark.usefixtures("without_pycolmap")
+def test_pinholes_are_read_without_pycolmap_and_others_ask_for_it(walk, binary):
+    write_colmap(walk, walk.folder / "sparse" / "0", binary=binary)
+    assert len(open_recording(read_colmap(walk.folder))) == 12
+    lens = {"model": "SIMPLE_RADIAL", "parameters": [50, 31, 25, 0.2]}
+    write_colmap(walk, walk.folder / "other", binary=binary, **lens)
+    with pytest.raises(ConfigError, match=r"not installed: pip install 'raytran\[colmap\]'$"):
+        read_colmap(walk.folder / "other")
 
 
 @pytest.mark.parametrize(

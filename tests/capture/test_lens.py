@@ -13,7 +13,6 @@ import pytest
 
 from raytran.capture.lens import (
     Lens,
-    _unit_camera,
     check_lens,
     colmap_lens,
     load_pycolmap,
@@ -156,21 +155,16 @@ def test_nerfstudios_fourth_coefficient_is_of_r8():
     assert opencv_lens((120, 160), PLAIN.focal, PLAIN.center, (0, 0, 0, 0), (0, 0), "frame 0") == PLAIN
 
 
-def test_only_a_lens_that_distorts_needs_pycolmap(monkeypatch):
-    monkeypatch.setitem(sys.modules, "pycolmap", None)
-    load_pycolmap.cache_clear()
-    _unit_camera.cache_clear()
-    try:
-        assert colmap_lens("SIMPLE_PINHOLE", (120, 160), [130, 78, 61], "camera 1").is_pinhole
-        assert opencv_lens((120, 160), PLAIN.focal, PLAIN.center, (0, 0, 0, 0), (0, 0), "frame 0").is_pinhole
-        for distorted in (
-            lambda: colmap_lens("OPENCV_FISHEYE", (120, 160), [130] * 8, "camera 1"),
-            lambda: opencv_lens((120, 160), PLAIN.focal, PLAIN.center, (0.1, 0, 0, 0), (0, 0), "frame 0"),
-        ):
-            with pytest.raises(ConfigError, match=r"pip install 'raytran\[colmap\]'$"):
-                distorted()
-    finally:
-        load_pycolmap.cache_clear()
+@pytest.mark.usefixtures("without_pycolmap")
+def test_only_a_lens_that_distorts_needs_pycolmap():
+    assert colmap_lens("SIMPLE_PINHOLE", (120, 160), [130, 78, 61], "camera 1").is_pinhole
+    assert opencv_lens((120, 160), PLAIN.focal, PLAIN.center, (0, 0, 0, 0), (0, 0), "frame 0").is_pinhole
+    for distorted in (
+        lambda: colmap_lens("OPENCV_FISHEYE", (120, 160), [130] * 8, "camera 1"),
+        lambda: opencv_lens((120, 160), PLAIN.focal, PLAIN.center, (0.1, 0, 0, 0), (0, 0), "frame 0"),
+    ):
+        with pytest.raises(ConfigError, match=r"pip install 'raytran\[colmap\]'$"):
+            distorted()
 
 
 def test_importing_pycolmap_leaves_sigterm_as_it_was():

@@ -155,11 +155,6 @@ def poses_at(track: Track, times: NDArray[np.float64]) -> NDArray[np.float64]:
     return poses
 
 
-def are_known(poses: NDArray[np.float64]) -> list[bool]:
-    """Return for each of ``(n, 4, 4)`` poses whether it is finite."""
-    return [bool(np.isfinite(pose).all()) for pose in poses]
-
-
 def read_camera(path: Path, image_size: tuple[int, int]) -> Lens:
     """Read intrinsics: a 3×3 or 4×4 matrix, or ``fx fy cx cy [k1 k2 p1 p2 [k3]]``.
 
@@ -230,7 +225,7 @@ def read_tum(path: Path) -> Recording:
         raise DataError(f"{path} has no images: put them in its folder rgb or images")
     lens = read_camera(find_intrinsics(path), stored_size([image for image, _ in images]))
     poses = poses_at(track, np.array([time for _, time in images]))
-    has_pose = are_known(poses)
+    has_pose = np.isfinite(poses).all(axis=(1, 2)).tolist()
     if not any(has_pose):
         raise DataError(
             f"none of the {len(images)} images of {path} has a pose at its time among the {len(track)} "

@@ -16,7 +16,6 @@ from raytran.capture.trajectory import (
     INTRINSICS_NAMES,
     TRACK_NAMES,
     Track,
-    are_known,
     poses_at,
     read_camera,
     read_track,
@@ -179,7 +178,7 @@ def read_video(path: Path) -> Recording:
         file.close()
     lens = read_camera(listed, image_size)
     poses = _poses(track, times, video)
-    has_pose = are_known(poses)
+    has_pose = np.isfinite(poses).all(axis=(1, 2)).tolist()
     return Recording(
         path=video,
         scene_id=video.stem,
@@ -216,7 +215,7 @@ def _poses(track: Track, times: NDArray[np.float64], video: Path) -> NDArray[np.
             )
         return track.world_from_camera
     poses = poses_at(track, times)
-    if not any(are_known(poses)):
+    if not np.isfinite(poses).all(axis=(1, 2)).any():
         raise DataError(
             f"{video} lasts from 0 to {times[-1]:.1f} s and the poses in {track.path.name} from "
             f"{track.times[0]:.1f} to {track.times[-1]:.1f} s: give times in seconds since the first frame"

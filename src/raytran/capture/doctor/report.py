@@ -44,7 +44,7 @@ _UP_COLOR = "#d62728"
 _MAX_POINTS, _MAX_RAYS = 4000, 250
 _FRAME_WIDTH = 480
 _RAY_LENGTH = 0.06
-"""Length of the drawn view rays as a share of the plan's width."""
+"""Length of the strokes that show where cameras look, as a share of the plan's width."""
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ def frames_to_show(
 
 
 def draw_plan(examination: Examination, cameras: CameraReading, extent: tuple[float, float, float]) -> bytes:
-    """Return a PNG: cameras, view rays, boxes, the volume and up, from above and from the side."""
+    """Return a PNG: cameras and where they look, boxes, the volume and up, from above and from the side."""
     figure = Figure(figsize=(11, 4.6), dpi=110, layout="constrained", facecolor="white")
     above, side = figure.subplots(1, 2, width_ratios=[1, 1])
     for axes, vertical, name in ((above, 1, "from above"), (side, 2, "from the side")):
