@@ -242,3 +242,17 @@ def test_lenses_of_two_cameras_are_refused():
 def test_what_is_no_lens(lens, message):
     with pytest.raises(DataError, match=f"camera 1 .*{message}"):
         check_lens(lens, "camera 1")
+
+
+@pytest.mark.parametrize("lens", [BARREL, FISHEYE])
+def test_colmaps_own_undistorter_gives_the_same_image(lens):
+    pycolmap = load_pycolmap()
+    params = [*lens.focal, *lens.center, *lens.distortion]
+    camera = pycolmap.Camera(model=lens.model, width=160, height=120, params=params)
+    same_size = pycolmap.UndistortCameraOptions()
+    same_size.min_scale = same_size.max_scale = 1.0
+    image = photograph(lens)
+    undistorted, pinhole = pycolmap.undistort_image(same_size, pycolmap.Bitmap.from_array(image), camera)
+    target = colmap_lens("PINHOLE", (120, 160), pinhole.params.tolist(), "camera 1")
+    ours = resample(image, lens, target).astype(int)
+    assert np.abs(ours - undistorted.to_array())[1:-1, 1:-1].max() <= 1
