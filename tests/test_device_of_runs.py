@@ -18,8 +18,8 @@ import torch.distributed as dist
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from raytran.capture.camera_list import CameraList
 from raytran.capture.lens import Lens
+from raytran.capture.render_cameras import RenderCameras
 from raytran.checkpoints.card import checkpoint_card
 from raytran.checkpoints.file import read_checkpoint
 from raytran.checkpoints.runs import LAST
@@ -404,7 +404,7 @@ def test_new_views(network, tmp_path):
         scene.views, ("0", "1"), Volumes(GRID, model.grid_extent, scene.grid_center.double()), ((0, 1),)
     )
     lens = Lens((60, 80), (70.0, 70.0), (40.0, 30.0))
-    wanted = CameraList(("a", "b"), (lens, lens), scene.new_views.world_from_camera[0].double())
+    wanted = RenderCameras(("a", "b"), (lens, lens), scene.new_views.world_from_camera[0].double())
     (tmp_path / "prediction").mkdir()
     with kernels_left_out():
         metrics = evaluate_model(model, [scene], tasks=("view",), progress=False).metrics

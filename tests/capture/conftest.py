@@ -1,15 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A walk through a room that is not there: plain images, poses that turn about, one pinhole camera."""
+"""A walk with plain images, known poses and a pinhole camera; and a furnished room that may be spoiled."""
 
 from __future__ import annotations
 
+import shutil
+import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from .forms import Walk
+from raytran.capture.doctor.matches import match_frames
+from raytran.capture.frames import RawScan, read_grey
+from raytran.capture.lens import _unit_camera, load_pycolmap
+from raytran.data.scannet.scan import read_scan
+
+from .forms import SCAN, Walk
 
 
 @pytest.fixture
@@ -29,3 +37,31 @@ def walk(tmp_path: Path) -> Walk:
     return Walk(
         images.parent, tuple(f"{n}.png" for n in range(12)), poses, (48, 64), (50.0, 51.0, 31.0, 25.0)
     )
+
+
+@pytest.fixture
+def without_pycolmap(monkeypatch):
+    """An installation without the extra ``colmap``."""
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    load_pycolmap.cache_clear()
+    _unit_camera.cache_clear()
+    yield
+    load_pycolmap.cache_clear()
+
+
+@pytest.fixture(scope="session")
+def raw(room):
+    """The scan of a furnished room."""
+    return RawScan.of(read_scan(room / "scannet" / "scans" / SCAN))
+
+
+@pytest.fixture(scope="session")
+def matches(raw):
+    """Points matched between its frames."""
+    return match_frames(partial(read_grey, raw.scan), len(raw))
+
+
+@pytest.fixture
+def copy(room, tmp_path):
+    """A copy of the room that may be spoiled."""
+    return shutil.copytree(room, tmp_path / "copy")

@@ -11,8 +11,19 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+SCAN = "scene0000_00"
+"""The scan in the room of the tests."""
+
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-MODEL_NUMBERS = {"PINHOLE": 1, "SIMPLE_RADIAL": 2, "OPENCV": 4, "OPENCV_FISHEYE": 5, "FULL_OPENCV": 6}
+MODEL_NUMBERS = {
+    "PINHOLE": 1,
+    "SIMPLE_RADIAL": 2,
+    "OPENCV": 4,
+    "OPENCV_FISHEYE": 5,
+    "FULL_OPENCV": 6,
+    "SIMPLE_RADIAL_FISHEYE": 8,
+    "RAD_TAN_THIN_PRISM_FISHEYE": 11,
+}
 
 
 @dataclass(frozen=True)

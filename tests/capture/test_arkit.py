@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from raytran.capture.arkit import find_log, read_arkit
-from raytran.capture.imported import from_files
+from raytran.capture.recording import open_recording
 from raytran.errors import DataError
 
 from .forms import OPENGL, words
@@ -78,7 +78,7 @@ def test_a_log_is_read(walk, name):
     source = read_arkit(folder)
     assert source.metric
     assert source.scene_id == "log"
-    scan = from_files(source)
+    scan = open_recording(source)
     poses = scan.world_from_camera.numpy()
     if name == "arkitscenes":
         assert (source.axes, source.up) == ("opencv", (0.0, 0.0, 1.0))
@@ -94,7 +94,7 @@ def test_images_and_logs_without_each_other_are_counted(walk):
     folder = write_scanner(walk, walk.folder.parent / "log")
     (folder / "frame_00003.json").unlink()
     (folder / "frame_00005.png").unlink()
-    assert from_files(read_arkit(folder)).dropped == {"frame_00003": "no pose", "frame_00005": "no image"}
+    assert open_recording(read_arkit(folder)).dropped == {"frame_00003": "no pose", "frame_00005": "no image"}
 
 
 def test_images_without_a_pose_or_intrinsics_near_are_counted(walk):
@@ -102,7 +102,7 @@ def test_images_without_a_pose_or_intrinsics_near_are_counted(walk):
     track = folder / "41254925_frames" / "lowres_wide.traj"
     track.write_text("\n".join(track.read_text().splitlines()[:9]))
     next((folder / "41254925_frames" / "lowres_wide_intrinsics").glob("*_3211.701.*")).unlink()
-    dropped = from_files(read_arkit(folder)).dropped
+    dropped = open_recording(read_arkit(folder)).dropped
     assert dropped == {
         f"41254925_{time}": "no pose" for time in ("3211.700", "3212.300", "3212.400", "3212.500")
     }

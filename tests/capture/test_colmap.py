@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from raytran.capture.colmap import find_model, read_colmap
-from raytran.capture.imported import from_files
-from raytran.errors import DataError
+from raytran.capture.recording import open_recording
+from raytran.errors import ConfigError, DataError
 
 from .forms import write_colmap
 
@@ -19,7 +19,7 @@ from .forms import write_colmap
 @pytest.mark.parametrize("binary", [True, False])
 def test_cameras_and_images_are_those_that_were_written(walk, binary):
     write_colmap(walk, walk.folder / "sparse" / "0", binary=binary)
-    scan = from_files(read_colmap(walk.folder))
+    scan = open_recording(read_colmap(walk.folder))
     assert scan.scene_id == "walk"
     assert scan.frame_id == tuple(str(n) for n in range(12))
     np.testing.assert_allclose(scan.world_from_camera.numpy(), walk.poses, atol=1e-12)
@@ -43,10 +43,10 @@ def test_pycolmap_reads_the_same(walk, binary, tmp_path):
     (tmp_path / "again").mkdir()
     (model.write_text if binary else model.write_binary)(str(tmp_path / "again"))
     for place in (folder, tmp_path / "again"):
-        shots = {shot.image.name: shot for shot in read_colmap(place).shots}
-        assert len(shots) == len(model.images) == 12
+        frames = {frame.image.name: frame for frame in read_colmap(place).frames}
+        assert len(frames) == len(model.images) == 12
         for image in model.images.values():
-            inverse = np.linalg.inv(shots[image.name].world_from_camera)[:3]
+            inverse = np.linalg.inv(frames[image.name].world_from_camera)[:3]
             np.testing.assert_allclose(inverse, image.cam_from_world().matrix(), atol=1e-9)
 
 
@@ -55,7 +55,7 @@ def test_the_model_is_found_where_tools_put_it(walk):
         write_colmap(walk, walk.folder / place, binary=True)
         assert find_model(walk.folder) == walk.folder / place
         # The folder of the model itself may be given: images are found above it.
-        assert len(from_files(read_colmap(walk.folder / place))) == 12
+        assert len(open_recording(read_colmap(walk.folder / place))) == 12
         shutil.rmtree(walk.folder / place.split("/")[0])
     assert find_model(walk.folder) is None
 
@@ -64,14 +64,14 @@ def test_of_several_models_the_largest_is_read(walk):
     few = replace(walk, names=walk.names[:3], poses=walk.poses[:3])
     write_colmap(few, walk.folder / "sparse" / "0", binary=True)
     write_colmap(walk, walk.folder / "sparse" / "1", binary=True)
-    assert len(read_colmap(walk.folder).shots) == 12
+    assert len(read_colmap(walk.folder).frames) == 12
 
 
 def test_images_without_poses_and_poses_without_images_are_counted(walk):
     write_colmap(walk, walk.folder / "sparse" / "0", binary=True)
     (walk.folder / "images" / "3.png").unlink()
     shutil.copy(walk.folder / "images" / "4.png", walk.folder / "images" / "99.png")
-    scan = from_files(read_colmap(walk.folder))
+    scan = open_recording(read_colmap(walk.folder))
     assert scan.dropped == {"3": "no image", "99": "no pose"}
     assert len(scan) == 11
 
@@ -79,7 +79,7 @@ def test_images_without_poses_and_poses_without_images_are_counted(walk):
 def test_smaller_copies_of_the_images_scale_the_lens(walk):
     large = replace(walk, image_size=(96, 128), camera=tuple(2 * value for value in walk.camera))
     write_colmap(large, walk.folder / "sparse" / "0", binary=False)
-    scan = from_files(read_colmap(walk.folder))
+    scan = open_recording(read_colmap(walk.folder))
     assert scan.image_size == (48, 64)
     assert scan.intrinsics[0, 0].item() == pytest.approx(walk.camera[0])
 
@@ -88,20 +88,72 @@ def test_a_lens_that_distorts_is_resampled(walk):
     write_colmap(
         walk, walk.folder / "sparse" / "0", binary=True, model="SIMPLE_RADIAL", parameters=[50, 31, 25, 0.2]
     )
-    scan = from_files(read_colmap(walk.folder))
+    scan = open_recording(read_colmap(walk.folder))
     assert scan.color_bytes(0) is None
     assert scan.read_color(5, (24, 32)).shape == (24, 32, 3)
     assert scan.intrinsics[0, 0].item() > 50
 
 
-def test_fisheyes_are_refused(walk):
-    model = {"model": "OPENCV_FISHEYE", "parameters": [50, 50, 32, 24, 0.1, 0, 0, 0]}
-    write_colmap(walk, walk.folder / "sparse" / "0", binary=True, **model)
-    with pytest.raises(DataError, match=r"OPENCV_FISHEYE, a fisheye.*image_undistorter"):
-        read_colmap(walk.folder)
-    write_colmap(walk, walk.folder / "text", binary=False, **model)
-    with pytest.raises(DataError, match=r"OPENCV_FISHEYE, a fisheye.*image_undistorter"):
-        read_colmap(walk.folder / "text")
+@pytest.mark.parametrize("binary", [True, False])
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("OPENCV_FISHEYE", [50, 50, 32, 24, 0.1, 0, 0, 0]),
+        ("SIMPLE_RADIAL_FISHEYE", [50, 32, 24, 0.1]),
+        ("RAD_TAN_THIN_PRISM_FISHEYE", [50, 50, 32, 24, 0.1, *[0.001] * 11]),
+    ],
+)
+def test_fisheyes_are_resampled(walk, binary, model, params):
+    write_colmap(walk, walk.folder / "sparse" / "0", binary=binary, model=model, parameters=params)
+    scan = open_recording(read_colmap(walk.folder))
+    assert scan.color_bytes(0) is None
+    assert scan.read_color(5)[24, 32].tolist() == [100] * 3
+    # A fisheye of the same focal length sees more than a pinhole, so no corner is empty without zooming.
+    assert scan.intrinsics[0, 0].item() == 50
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_the_cameras_of_a_rig_get_poses_of_their_own(walk, binary, tmp_path):
+    """Four frames of a rig with two cameras, as pycolmap writes it: the second looks to the side."""
+    pycolmap = pytest.importorskip("pycolmap")
+    rig = pycolmap.Rig(rig_id=1)
+    model = pycolmap.Reconstruction()
+    for number in (1, 2):
+        camera = pycolmap.Camera(
+            camera_id=number, model="PINHOLE", width=64, height=48, params=list(walk.camera)
+        )
+        model.add_camera(camera)
+    side_from_front = np.c_[np.array([[0.0, 0, -1], [0, 1, 0], [1, 0, 0]]), [0.1, 0.0, 0.05]]
+    rig.add_ref_sensor(model.cameras[1].sensor_id)
+    rig.add_sensor(model.cameras[2].sensor_id, pycolmap.Rigid3d(side_from_front))
+    model.add_rig(rig)
+    expected = {}
+    (walk.folder / "images" / "side").mkdir()
+    for n in range(4):
+        frame = pycolmap.Frame(frame_id=n + 1, rig_id=1)
+        names = (f"{n}.png", f"side/{n}.png")
+        images = [
+            pycolmap.Image(image_id=2 * n + k, name=names[k], camera_id=k + 1, frame_id=n + 1) for k in (0, 1)
+        ]
+        for image in images:
+            frame.add_data_id(image.data_id)
+        front = np.linalg.inv(walk.poses[n])
+        frame.rig_from_world = pycolmap.Rigid3d(front[:3])
+        model.add_frame(frame)
+        for image in images:
+            model.add_image(image)
+        model.register_frame(n + 1)
+        shutil.copy(walk.folder / "images" / names[0], walk.folder / "images" / names[1])
+        expected[f"{n}"] = walk.poses[n]
+        expected[f"side_{n}"] = np.linalg.inv(np.vstack([side_from_front, [0, 0, 0, 1]]) @ front)
+    folder = walk.folder / "sparse" / "0"
+    folder.mkdir(parents=True)
+    (model.write_binary if binary else model.write_text)(str(folder))
+    assert (folder / f"rigs.{'bin' if binary else 'txt'}").is_file()
+    scan = open_recording(read_colmap(walk.folder))
+    assert set(scan.frame_id) == set(expected)
+    for name, pose in zip(scan.frame_id, scan.world_from_camera.numpy(), strict=True):
+        np.testing.assert_allclose(pose, expected[name], atol=1e-9)
 
 
 def test_every_cut_of_a_binary_file_is_one_sentence(walk):
@@ -118,6 +170,38 @@ def test_every_cut_of_a_binary_file_is_one_sentence(walk):
     (folder / "images.bin").write_bytes(b"\xff" * 7 + whole[7:])
     with pytest.raises(DataError, match="ends early"):
         read_colmap(walk.folder)
+
+
+def test_random_damage_is_one_sentence_or_another_model(walk):
+    rng = np.random.default_rng(0)
+    folder = walk.folder / "sparse" / "0"
+    lens = {"model": "OPENCV_FISHEYE", "parameters": [50, 50, 32, 24, 0.01, 0.01, 0.01, 0.01]}
+    refused: list[str] = []
+    for case in range(60):
+        write_colmap(walk, folder, binary=case % 3 > 0, **lens)
+        path = sorted(folder.iterdir())[int(rng.integers(2))]
+        content = bytearray(path.read_bytes())
+        for at in rng.integers(len(content), size=4):
+            content[at] = rng.integers(256)
+        path.write_bytes(content)
+        try:
+            read_colmap(walk.folder)
+        except DataError as error:
+            refused.append(str(error))
+        shutil.rmtree(folder)
+    assert len(refused) > 20
+    assert not any("\n" in message for message in refused)
+
+
+@pytest.mark.parametrize("binary", [True, False])
+@pytest.mark.usefixtures("without_pycolmap")
+def test_pinholes_are_read_without_pycolmap_and_others_ask_for_it(walk, binary):
+    write_colmap(walk, walk.folder / "sparse" / "0", binary=binary)
+    assert len(open_recording(read_colmap(walk.folder))) == 12
+    lens = {"model": "SIMPLE_RADIAL", "parameters": [50, 31, 25, 0.2]}
+    write_colmap(walk, walk.folder / "other", binary=binary, **lens)
+    with pytest.raises(ConfigError, match=r"not installed: pip install 'raytran\[colmap\]'$"):
+        read_colmap(walk.folder / "other")
 
 
 @pytest.mark.parametrize(
@@ -148,7 +232,7 @@ def test_no_model_and_no_images(walk):
     write_colmap(walk, walk.folder / "sparse" / "0", binary=True)
     shutil.rmtree(walk.folder / "images")
     with pytest.raises(DataError, match=r"none of the 12 frames .*\(12 no image\): check that its images"):
-        from_files(read_colmap(walk.folder))
+        open_recording(read_colmap(walk.folder))
 
 
 def test_images_of_another_shape_are_refused(walk):
@@ -158,4 +242,4 @@ def test_images_of_another_shape_are_refused(walk):
     with pytest.raises(
         DataError, match=r"image 0 is 64x48 and its intrinsics .* for 48x64, turned by 90°: give"
     ):
-        from_files(read_colmap(walk.folder))
+        open_recording(read_colmap(walk.folder))

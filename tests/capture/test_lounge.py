@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from raytran.capture.open import open_scene
-from raytran.capture.orient import WorldSettings
+from raytran.capture.orientation import WorldSettings
 from raytran.data.scan import even_views
 from raytran.data.scannet.scan import read_scan
 from raytran.run.entry import compose

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from raytran.capture.imported import from_files
 from raytran.capture.nerfstudio import read_nerfstudio
+from raytran.capture.recording import open_recording
 from raytran.errors import DataError
 
 from .forms import OPENGL, transforms, write_transforms
@@ -22,7 +22,7 @@ from .forms import OPENGL, transforms, write_transforms
 def opened(walk, **changes):
     source = read_nerfstudio(write_transforms(walk, **changes))
     assert source.axes == "opengl"
-    return from_files(source)
+    return open_recording(source)
 
 
 def test_poses_intrinsics_and_images_are_those_that_were_written(walk):
@@ -63,7 +63,7 @@ def test_an_angle_of_view_will_do_and_names_without_ending(walk):
         frame["file_path"] = "./" + frame["file_path"].removesuffix(".png")
     angle = 2 * math.atan(64 / 2 / 50)
     (walk.folder / "transforms.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
-    scan = from_files(read_nerfstudio(walk.folder))
+    scan = open_recording(read_nerfstudio(walk.folder))
     assert scan.intrinsics.numpy()[[0, 1, 0, 1], [0, 1, 2, 2]] == pytest.approx([50, 50, 32, 24])
     assert len(scan) == 12
 
@@ -71,6 +71,14 @@ def test_an_angle_of_view_will_do_and_names_without_ending(walk):
 def test_distortion_is_read_unless_the_model_has_none(walk):
     assert opened(walk, k1=0.2).color_bytes(0) is None
     assert opened(walk, k1=0.2, camera_model="PINHOLE").color_bytes(0) is not None
+
+
+@pytest.mark.parametrize("changes", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
+def test_a_fisheye_is_resampled(walk, changes):
+    scan = opened(walk, k1=0.1, k2=0.01, **changes)
+    assert (scan.lens[0].model, scan.lens[0].distortion) == ("OPENCV_FISHEYE", (0.1, 0.01, 0.0, 0.0))
+    assert scan.color_bytes(0) is None
+    assert scan.read_color(7)[24, 32].tolist() == [140] * 3
 
 
 def test_images_without_poses_and_poses_without_images_are_counted(walk):
@@ -96,9 +104,8 @@ def test_a_pose_that_is_none_is_dropped(walk):
         ({"frames": [{"file_path": "images/0.png"}]}, "frame 0 of .* has no transform_matrix"),
         ({"fl_x": "wide"}, "has fl_x = 'wide' where a number is needed"),
         ({"fl_x": float("inf")}, "where a number is needed"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "OPENCV_FISHEYE, which is not read: undistort"),
+        ({"camera_model": "OPENCV_FISHEYE", "k1": -3}, "the distortion of frame 0 .* folds the image"),
         ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR, which is not read: undistort"),
-        ({"is_fisheye": True}, "camera model fisheye, which is not read"),
         ({"w": 100_000, "h": 100_000}, "100000x100000"),
         ({"w": 48, "h": 64, "cx": 25, "cy": 31}, "is 64x48 and its intrinsics .* for 48x64, turned by 90°"),
         ({"applied_transform": [[0, 0, 0, 0]] * 3}, "applied_transform .* cannot be undone"),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from raytran.capture.open import FORMATS, open_scene
-from raytran.capture.orient import WorldSettings
+from raytran.capture.orientation import WorldSettings
 from raytran.errors import ConfigError, DataError
 
 from ..scan_forms import write_form
@@ -36,7 +36,8 @@ def scannet(walk):
     return folder
 
 
-def test_a_walk_is_the_same_in_every_form(walk, scannet, tmp_path):
+@pytest.mark.usefixtures("without_pycolmap")
+def test_a_walk_is_the_same_in_every_form_and_needs_no_extra(walk, scannet, tmp_path):
     places = {"scannet": scannet, "nerfstudio": write_transforms(walk), "tum": tmp_path / "tum"}
     write_tum(walk, places["tum"], np.arange(12) / 10)
     for name, write in WRITERS.items():

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from raytran.capture.imported import from_files
 from raytran.capture.record3d import find_metadata, read_record3d
+from raytran.capture.recording import open_recording
 from raytran.errors import DataError
 
 from .forms import OPENGL
@@ -43,7 +43,7 @@ def folder(walk):
 def test_an_export_is_read(walk, folder):
     source = read_record3d(folder)
     assert (source.axes, source.up, source.metric) == ("opengl", None, True)
-    scan = from_files(source)
+    scan = open_recording(source)
     np.testing.assert_allclose(scan.world_from_camera.numpy() @ OPENGL, walk.poses, atol=1e-9)
     assert scan.intrinsics.numpy()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist() == list(walk.camera)
     # 10 comes after 9, as its pose does.
@@ -57,13 +57,13 @@ def test_an_unzipped_recording_and_its_other_form(walk, folder, images):
     (folder / "metadata.json").rename(folder / "metadata")
     (folder / images / "0.depth").write_bytes(b"lzfse")
     assert find_metadata(folder) == folder / "metadata"
-    assert len(from_files(read_record3d(folder))) == 12
+    assert len(open_recording(read_record3d(folder))) == 12
 
 
 def test_a_focus_that_changes_is_followed(walk, folder):
     table = [[50 + 0.1 * n, 51, 31, 25] for n in range(12)]
     (folder / "metadata.json").write_text(json.dumps(metadata(walk, perFrameIntrinsicCoeffs=table)))
-    scan = from_files(read_record3d(folder))
+    scan = open_recording(read_record3d(folder))
     assert scan.lens[11].focal[0] == pytest.approx(51.1)
     assert scan.color_bytes(11) is None
 
@@ -82,7 +82,7 @@ def test_a_focus_that_changes_is_followed(walk, folder):
 def test_mistakes_are_one_sentence(walk, folder, changes, message):
     (folder / "metadata.json").write_text(json.dumps(metadata(walk, **changes)))
     with pytest.raises(DataError, match=message):
-        from_files(read_record3d(folder))
+        open_recording(read_record3d(folder))
 
 
 def test_packed_or_no_recordings(folder):

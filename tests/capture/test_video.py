@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from raytran.capture.video import VideoFile, find_video, from_video, read_video
+from raytran.capture.video import VideoFile, find_video, open_video, read_video
 from raytran.errors import ConfigError, DataError
 
 from .forms import tum_line, words, write_video
@@ -31,7 +31,7 @@ def video(walk, tmp_path):
 
 
 def test_frames_and_poses_belong_together(walk, video):
-    with from_video(read_video(video)) as scan:
+    with open_video(read_video(video)) as scan:
         assert scan.scene_id == "walk"
         assert scan.path == video / "walk.mp4"
         assert scan.frame_id == tuple(str(n) for n in range(12))
@@ -49,7 +49,7 @@ def test_frames_and_poses_belong_together(walk, video):
 def test_frames_without_a_pose_are_counted(walk, video):
     lines = (video / "walk.txt").read_text().splitlines()
     (video / "walk.txt").write_text("\n".join(lines[:6]))
-    with from_video(read_video(video)) as scan:
+    with open_video(read_video(video)) as scan:
         assert len(scan) == 6
         assert set(scan.dropped.values()) == {"no pose"}
         assert list(scan.dropped) == [str(n) for n in range(6, 12)]
@@ -57,7 +57,7 @@ def test_frames_without_a_pose_are_counted(walk, video):
 
 def test_poses_without_times_are_one_per_frame(walk, video):
     (video / "walk.txt").write_text("\n".join(words(pose.ravel()) for pose in walk.poses))
-    with from_video(read_video(video / "walk.mp4")) as scan:
+    with open_video(read_video(video / "walk.mp4")) as scan:
         np.testing.assert_allclose(scan.world_from_camera.numpy(), walk.poses)
     (video / "walk.txt").write_text("\n".join(words(pose.ravel()) for pose in walk.poses[:9]))
     with pytest.raises(
@@ -117,7 +117,7 @@ def test_damaged_frames_are_errors_of_those_frames(walk, video):
     raw[start + size // 2 : start + size - 8] = bytes(size - 8 - size // 2)
     (video / "walk.mp4").write_bytes(raw)
     messages = {}
-    with from_video(read_video(video)) as scan:
+    with open_video(read_video(video)) as scan:
         for n in range(12):
             try:
                 assert scan.read_color(n).shape == (48, 64, 3)

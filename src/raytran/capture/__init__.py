@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Videos of one's own: readers that turn what phones and reconstruction programs write into a scan."""
+"""Recordings of one's own: readers of what phones and reconstruction programs write, and the data doctor."""

@@ -1,12 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lenses with distortion, and resampling their images to one pinhole camera."""
+"""Lenses: COLMAP's models of distortion, and resampling the images of all lenses to one pinhole camera.
+
+Distortion is computed by pycolmap (extra ``colmap``), which knows every model of COLMAP, fisheyes among them.
+A camera without distortion needs no extra.
+"""
 
 from __future__ import annotations
 
+import importlib
+import signal
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,77 +23,183 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from raytran.data.images import MAX_SIDE
-from raytran.errors import DataError
+from raytran.errors import ConfigError, DataError
 
 _SAME_PX = 0.25
-"""Largest shift of a pixel for which an image is used as it is."""
+"""Largest shift of a pixel for which an image is used without resampling, pixels."""
 
 _SAME_FOCAL = 0.1
-"""Largest relative difference of focal lengths, of one walk; autofocus moves them by 2 %."""
+"""Largest relative difference between the focal lengths of one recording; autofocus moves them by 2 %."""
 
 _SAME_ASPECT = 0.01
-_OFF_CENTRE = 0.15
+_OFF_CENTER = 0.15
 """Largest distance of the principal point from the image centre, in widths or heights."""
 
-_MOST_ZOOM = 1.5
+_MAX_ZOOM = 1.5
+
+_PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
+_PINHOLE_AT_ZERO = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION")
+"""Models that are a pinhole when all their coefficients are zero."""
+
+
+@dataclass(frozen=True)
+class LensModel:
+    """The layout of a COLMAP camera model's parameters: focal lengths, principal point, distortion.
+
+    Attributes:
+        name: e.g. ``OPENCV_FISHEYE``.
+        num_focal: 1 (one focal length f) or 2 (fx, fy).
+        num_params: number of all parameters.
+    """
+
+    name: str
+    num_focal: int
+    num_params: int
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A perspective camera with the distortion of OpenCV's and COLMAP's models; may be compared and hashed.
+    """A camera: a pinhole, and the distortion of one of COLMAP's models; hashable.
 
-    A point (x, y) at depth one is imaged at ``focal · d(x, y) + center``, where d scales it by
-    ``(1 + Σ radialᵢ r²ⁱ) / (1 + Σ divisorᵢ r²ⁱ)`` and shifts it by the tangential part (OpenCV, "Camera
-    Calibration and 3D Reconstruction").
+    A point (x, y) of the plane at depth one is imaged at ``focal · d(x, y) + center``, where d is the model
+    with unit focal length (COLMAP, "Camera Models"; OpenCV, "Camera Calibration and 3D Reconstruction").
 
     Attributes:
         size: ``(H, W)`` of its images.
         focal: fx, fy in pixels.
         center: cx, cy in pixels from the image's corner.
-        radial: k1, k2, ... of the numerator.
-        divisor: coefficients of the denominator, OpenCV's k4, k5, k6.
-        tangential: p1, p2.
+        model: name of the COLMAP model.
+        distortion: the model's parameters after the principal point.
+        radial_8: coefficient of r⁸ that is added to the radial factor: nerfstudio's ``k4``, which no
+            perspective model of COLMAP has.
     """
 
     size: tuple[int, int]
     focal: tuple[float, float]
     center: tuple[float, float]
-    radial: tuple[float, ...] = ()
-    divisor: tuple[float, ...] = ()
-    tangential: tuple[float, float] = (0.0, 0.0)
+    model: str = "PINHOLE"
+    distortion: tuple[float, ...] = ()
+    radial_8: float = 0.0
 
     @property
     def matrix(self) -> Tensor:
-        """``(3, 3)`` float64 intrinsics, distortion left out."""
+        """``(3, 3)`` float64 intrinsics, without the distortion."""
         (fx, fy), (cx, cy) = self.focal, self.center
         return torch.tensor([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
     @property
     def is_pinhole(self) -> bool:
-        """Whether it does not distort."""
-        return not any((*self.radial, *self.divisor, *self.tangential))
+        """Whether straight lines stay straight."""
+        is_zero = not any(self.distortion) and self.radial_8 == 0
+        return self.model in _PINHOLES or (self.model in _PINHOLE_AT_ZERO and is_zero)
 
     def scaled_to(self, size: tuple[int, int]) -> Lens:
         """Return the lens of the same images resized to ``size`` (H, W)."""
-        down, across = size[0] / self.size[0], size[1] / self.size[1]
+        scale_y = size[0] / self.size[0]
+        scale_x = size[1] / self.size[1]
         (fx, fy), (cx, cy) = self.focal, self.center
-        return replace(self, size=size, focal=(fx * across, fy * down), center=(cx * across, cy * down))
+        focal = (fx * scale_x, fy * scale_y)
+        return replace(self, size=size, focal=focal, center=(cx * scale_x, cy * scale_y))
 
     def distort(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return where points ``(..., 2)`` of the plane at depth one seem to be."""
-        square = (points**2).sum(axis=-1, keepdims=True)
-        powers = [square ** (i + 1) for i in range(max(len(self.radial), len(self.divisor)))]
-        above = 1 + sum((k * p for k, p in zip(self.radial, powers, strict=False)), np.zeros_like(square))
-        below = 1 + sum((k * p for k, p in zip(self.divisor, powers, strict=False)), np.zeros_like(square))
-        p1, p2 = self.tangential
-        cross = 2 * points[..., :1] * points[..., 1:]
-        shift = np.array([p2, p1]) * (square + 2 * points**2) + np.array([p1, p2]) * cross
-        return points * (above / below) + shift
+        """Return d of points ``(..., 2)`` of the plane at depth one; NaN where the model has no image.
+
+        Raises:
+            ConfigError: the lens distorts and pycolmap is not installed.
+        """
+        if self.is_pinhole:
+            return points
+        flat = points.reshape(-1, 2)
+        rays = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+        distorted = _unit_camera(self.model, self.distortion).img_from_cam(rays)
+        if self.radial_8:
+            distorted = distorted + self.radial_8 * (flat**2).sum(axis=1, keepdims=True) ** 4 * flat
+        return np.asarray(distorted, dtype=np.float64).reshape(points.shape)
 
     def image_of(self, pinhole: Lens, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return this lens's pixels ``(..., 2)`` that show what a pinhole with the same pose shows in its."""
+        """Return where this lens shows what a pinhole with the same pose shows at ``pixels`` ``(..., 2)``."""
         plane = (pixels - np.array(pinhole.center)) / np.array(pinhole.focal)
         return self.distort(plane) * np.array(self.focal) + np.array(self.center)
+
+
+def lens_model(model: str | int, where: str) -> LensModel:
+    """Return the parameter layout of a COLMAP camera model.
+
+    Args:
+        model: its name, or its number in binary files.
+        where: name of the camera in messages.
+
+    Raises:
+        ConfigError: it distorts and pycolmap is not installed.
+        DataError: pycolmap does not know it, or it is no lens but a panorama.
+    """
+    if model in ("SIMPLE_PINHOLE", 0):
+        return LensModel("SIMPLE_PINHOLE", 1, 3)
+    if model in ("PINHOLE", 1):
+        return LensModel("PINHOLE", 2, 4)
+    pycolmap = load_pycolmap()
+    models = {name: int(id_.value) for name, id_ in pycolmap.CameraModelId.__members__.items()}
+    name = model if isinstance(model, str) else next((n for n, id_ in models.items() if id_ == model), "")
+    if name not in models or name == "INVALID":
+        raise DataError(
+            f"{where} has the lens model {str(model)[:50]}, which pycolmap {pycolmap.__version__} does not "
+            "know: undistort the images with COLMAP's image_undistorter and give the folder that it writes"
+        )
+    camera = pycolmap.Camera.create_from_model_id(1, pycolmap.CameraModelId.__members__[name], 1.0, 1, 1)
+    if not len(camera.focal_length_idxs()):
+        raise DataError(f"{where} is a panorama ({name}): cut it into perspective images and give these")
+    return LensModel(name, len(camera.focal_length_idxs()), len(camera.params))
+
+
+def colmap_lens(model: str | int, size: tuple[int, int], params: Sequence[float], where: str) -> Lens:
+    """Return the lens that COLMAP describes by a model and its parameters.
+
+    Args:
+        model: name or number of the camera model.
+        size: ``(H, W)`` of the images.
+        params: in COLMAP's order.
+        where: name of the camera in messages.
+
+    Raises:
+        ConfigError, DataError: see ``lens_model`` and ``check_lens``; or the parameters are too few or many.
+    """
+    layout = lens_model(model, where)
+    if len(params) != layout.num_params:
+        raise DataError(
+            f"{where} has {len(params)} parameters for {layout.name}, not {layout.num_params}: "
+            "export it again"
+        )
+    fx, fy = params[0], params[layout.num_focal - 1]
+    cx, cy, *distortion = params[layout.num_focal :]
+    name = "PINHOLE" if layout.name in _PINHOLES else layout.name
+    return check_lens(Lens(size, (fx, fy), (cx, cy), name, tuple(distortion)), where)
+
+
+def opencv_lens(
+    size: tuple[int, int],
+    focal: tuple[float, float],
+    center: tuple[float, float],
+    radial: tuple[float, float, float, float],
+    tangential: tuple[float, float],
+    where: str,
+) -> Lens:
+    """Return a perspective lens with OpenCV's distortion, which programs other than COLMAP write.
+
+    Args:
+        size: ``(H, W)`` of the images.
+        focal: fx, fy, pixels.
+        center: cx, cy, pixels.
+        radial: coefficients of r², r⁴, r⁶ and r⁸.
+        tangential: p1, p2.
+        where: name of the camera in messages.
+
+    Raises:
+        ConfigError, DataError: see ``check_lens``.
+    """
+    k1, k2, k3, k4 = radial
+    p1, p2 = tangential
+    lens = Lens(size, focal, center, "FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0), radial_8=k4)
+    return check_lens(Lens(size, focal, center) if lens.is_pinhole else lens, where)
 
 
 def check_lens(lens: Lens, where: str) -> Lens:
@@ -96,10 +210,11 @@ def check_lens(lens: Lens, where: str) -> Lens:
         where: name of the camera in the message, e.g. ``camera 1 in cameras.txt``.
 
     Raises:
+        ConfigError: it distorts and pycolmap is not installed.
         DataError: sizes or focal lengths are not positive, numbers are not finite, the image is larger than
             ``MAX_SIDE``, the principal point is far off the centre, or the distortion folds the image.
     """
-    numbers = (*lens.focal, *lens.center, *lens.radial, *lens.divisor, *lens.tangential)
+    numbers = (*lens.focal, *lens.center, *lens.distortion, lens.radial_8)
     if not np.isfinite(numbers).all() or min(lens.focal) <= 0:
         raise DataError(f"{where} has no positive, finite focal lengths and centre: calibrate it again")
     height, width = lens.size
@@ -109,19 +224,30 @@ def check_lens(lens: Lens, where: str) -> Lens:
             "shrink the images, and the intrinsics with them"
         )
     off = max(abs(lens.center[0] / width - 0.5), abs(lens.center[1] / height - 0.5))
-    if off > _OFF_CENTRE:
+    if off > _OFF_CENTER:
         raise DataError(
             f"{where} has its principal point at ({lens.center[0]:.1f}, {lens.center[1]:.1f}), far from the "
             f"middle of {width}x{height}: give the intrinsics of the stored images"
         )
-    radius = np.linspace(0, 1, 65)[:, None] * np.hypot(width / lens.focal[0], height / lens.focal[1]) / 2
-    seen = replace(lens, tangential=(0.0, 0.0)).distort(radius * np.array([1.0, 0.0]))[:, 0]
-    if not (np.diff(seen) > 0).all():
+    if not lens.is_pinhole and _folds(lens):
         raise DataError(
             f"the distortion of {where} folds the image onto itself: calibrate it again, or undistort the "
             "images (COLMAP: image_undistorter)"
         )
     return lens
+
+
+def _folds(lens: Lens) -> bool:
+    """Whether two points on one ray from the centre, within the image, would be seen at the same place."""
+    height, width = lens.size
+    corner = float(np.hypot(width / lens.focal[0], height / lens.focal[1])) / 2
+    angle = np.arange(8) * np.pi / 4
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)[:, None]
+    radius = np.linspace(0, corner, 65)[:, None]
+    # (8, 65): how far from the centre each point is seen, measured along its direction.
+    seen = (lens.distort(direction * radius) * direction).sum(axis=-1)
+    # NaN, where the model has no image, is not greater than zero either.
+    return not bool((np.diff(seen, axis=1) > 0).all())
 
 
 def shared_pinhole(lenses: Sequence[Lens], where: Path) -> Lens:
@@ -140,20 +266,21 @@ def shared_pinhole(lenses: Sequence[Lens], where: Path) -> Lens:
     sizes = [lens.size for lens in lenses]
     size = max(sorted(set(sizes)), key=sizes.count)
     numbers = np.array([(*lens.focal, *lens.center) for lens in (lens.scaled_to(size) for lens in lenses)])
-    middle = np.median(numbers, axis=0)
-    aspect = np.array([(s[1] / s[0]) / (size[1] / size[0]) for s in sizes])
-    if np.abs(numbers[:, :2] / middle[:2] - 1).max() > _SAME_FOCAL or np.abs(aspect - 1).max() > _SAME_ASPECT:
-        other = int(np.abs(numbers[:, :2] / middle[:2] - 1).max(axis=1).argmax())
-        other = int(np.abs(aspect - 1).argmax()) if np.abs(aspect - 1).max() > _SAME_ASPECT else other
+    median = np.median(numbers, axis=0)
+    focal_error = np.abs(numbers[:, :2] / median[:2] - 1).max(axis=1)
+    aspect_error = np.abs(np.array([(s[1] / s[0]) / (size[1] / size[0]) for s in sizes]) - 1)
+    if focal_error.max() > _SAME_FOCAL or aspect_error.max() > _SAME_ASPECT:
+        error = aspect_error if aspect_error.max() > _SAME_ASPECT else focal_error
+        other = int(error.argmax())
         raise DataError(
             f"{where} has images of different cameras, {size[1]}x{size[0]} with a focal length of "
-            f"{middle[0]:.0f} pixels and {sizes[other][1]}x{sizes[other][0]} with "
+            f"{median[0]:.0f} pixels and {sizes[other][1]}x{sizes[other][0]} with "
             f"{lenses[other].focal[0]:.0f}: give the images of one camera, held one way, at a time"
         )
-    fx, fy, cx, cy = (float(value) for value in middle)
+    fx, fy, cx, cy = (float(value) for value in median)
     pinhole = Lens(size, (fx, fy), (cx, cy))
     different = set(lenses)
-    for zoom in np.arange(1.0, _MOST_ZOOM, 0.01).tolist():
+    for zoom in np.arange(1.0, _MAX_ZOOM, 0.01).tolist():
         zoomed = replace(pinhole, focal=(fx * zoom, fy * zoom))
         if all(_fills(lens, zoomed) for lens in different):
             return zoomed
@@ -166,7 +293,7 @@ def needs_resampling(lens: Lens, pinhole: Lens) -> bool:
         return False
     border = _border(pinhole.size)
     shift = lens.scaled_to(pinhole.size).image_of(pinhole, border) - border
-    return float(np.abs(shift).max()) > _SAME_PX
+    return not float(np.abs(shift).max()) <= _SAME_PX
 
 
 def resample(image: NDArray[np.uint8], lens: Lens, pinhole: Lens) -> NDArray[np.uint8]:
@@ -180,21 +307,20 @@ def resample(image: NDArray[np.uint8], lens: Lens, pinhole: Lens) -> NDArray[np.
     Returns:
         ``(H, W, 3)``.
     """
-    height, width = image.shape[:2]
     source = torch.from_numpy(image).permute(2, 0, 1)[None].float()
-    grid = _sampling_grid(lens, pinhole, (height, width))
+    grid = _sampling_grid(lens, pinhole, (image.shape[0], image.shape[1]))
     sampled = grid_sample(source, grid, mode="bilinear", padding_mode="border", align_corners=False)
     return sampled[0].round().clamp(0, 255).to(torch.uint8).permute(1, 2, 0).numpy()
 
 
 @lru_cache(maxsize=4)
 def _sampling_grid(lens: Lens, pinhole: Lens, size: tuple[int, int]) -> Tensor:
-    """Return ``(1, H, W, 2)`` places in the lens's image, from -1 to 1 between its corners."""
+    """Return ``(1, H, W, 2)`` positions in the lens's image, from -1 to 1 between its corners."""
     target = pinhole.scaled_to(size)
     column, row = np.meshgrid(np.arange(size[1]) + 0.5, np.arange(size[0]) + 0.5)
     pixels = lens.image_of(target, np.stack([column, row], axis=-1))
-    places = 2 * pixels / np.array([lens.size[1], lens.size[0]]) - 1
-    return torch.from_numpy(places.astype(np.float32))[None]
+    positions = 2 * pixels / np.array([lens.size[1], lens.size[0]]) - 1
+    return torch.from_numpy(np.nan_to_num(positions, nan=2.0).astype(np.float32))[None]
 
 
 def _fills(lens: Lens, pinhole: Lens) -> bool:
@@ -209,3 +335,32 @@ def _border(size: tuple[int, int]) -> NDArray[np.float64]:
     zero, one = np.zeros(16), np.ones(16)
     sides = [(step, zero), (one, step), (1 - step, one), (zero, 1 - step)]
     return np.concatenate([np.stack([u * width, v * height], axis=1) for u, v in sides])
+
+
+@lru_cache(maxsize=256)
+def _unit_camera(model: str, distortion: tuple[float, ...]) -> Any:
+    """Return pycolmap's camera of a model with focal length 1 and principal point 0."""
+    num_focal = lens_model(model, "a lens").num_focal
+    params = [*[1.0] * num_focal, 0.0, 0.0, *distortion]
+    return load_pycolmap().Camera(model=model, width=1, height=1, params=params)
+
+
+@cache
+def load_pycolmap() -> Any:
+    """Import pycolmap.
+
+    Raises:
+        ConfigError: it is not installed.
+    """
+    terminate = signal.getsignal(signal.SIGTERM)
+    try:
+        pycolmap = importlib.import_module("pycolmap")
+    except ImportError as error:
+        raise ConfigError(
+            "lenses that distort are computed by pycolmap, which is not installed: "
+            "pip install 'raytran[colmap]'"
+        ) from error
+    # Its import makes SIGTERM print a stack trace in place of what was to happen.
+    if terminate is not None and threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGTERM, terminate)
+    return pycolmap

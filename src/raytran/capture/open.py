@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scene in whatever form: recognised, read, and brought to our world."""
+"""Opening a scene in any format: the format is recognised, its reader called, the world brought to ours."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pathlib import Path
 
 from raytran.capture.arkit import find_log, read_arkit
 from raytran.capture.colmap import find_model, read_colmap
-from raytran.capture.imported import ImportedScan, Source, from_files
 from raytran.capture.nerfstudio import find_transforms, read_nerfstudio
-from raytran.capture.orient import WorldSettings, to_our_world
+from raytran.capture.orientation import WorldSettings, to_our_world
 from raytran.capture.record3d import find_metadata, read_record3d
-from raytran.capture.tum import is_tum, read_tum
-from raytran.capture.video import find_video, from_video, read_video
+from raytran.capture.recording import RecordedScan, Recording, open_recording
+from raytran.capture.trajectory import is_tum, read_tum
+from raytran.capture.video import find_video, open_video, read_video
 from raytran.data.scan import OpenScan
 from raytran.data.scannet.layout import Listing, recognise
 from raytran.data.scannet.scan import open_scan
@@ -26,11 +26,11 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class _Format:
-    """How to tell a format, to read its poses, and to open its images."""
+    """How to recognise a format, to read its poses, and to open its images."""
 
     fits: Callable[[Path], bool]
-    read: Callable[[Path], Source]
-    open: Callable[[Source], ImportedScan] = from_files
+    read: Callable[[Path], Recording]
+    open: Callable[[Recording], RecordedScan] = open_recording
 
 
 _FORMATS = {
@@ -39,9 +39,9 @@ _FORMATS = {
     "arkit": _Format(lambda path: find_log(path) is not None, read_arkit),
     "colmap": _Format(lambda path: find_model(path) is not None, read_colmap),
     "tum": _Format(is_tum, read_tum),
-    "video": _Format(lambda path: find_video(path) is not None, read_video, from_video),
+    "video": _Format(lambda path: find_video(path) is not None, read_video, open_video),
 }
-"""Formats beside ScanNet's, the one to prefer first."""
+"""Formats beside ScanNet's, in the order of preference."""
 
 FORMATS: tuple[str, ...] = ("auto", "scannet", *_FORMATS)
 
@@ -57,8 +57,9 @@ def open_scene(path: Path, *, format: str = "auto", settings: WorldSettings | No
         settings: what is known of its world; None: everything is left to the format and the images.
 
     Raises:
-        ConfigError: the format is unknown.
-        DataError: nothing is there, or in no known form, or it is damaged; see the reader of its format.
+        ConfigError: the format is unknown, or a package is missing: PyAV for videos, pycolmap for lenses that
+            distort.
+        DataError: the path does not exist, or fits no format, or is damaged; see the reader of its format.
     """
     if format not in FORMATS:
         raise ConfigError(f"unknown format={format}: choose one of {', '.join(FORMATS)}")
@@ -67,10 +68,10 @@ def open_scene(path: Path, *, format: str = "auto", settings: WorldSettings | No
     name = _recognised(path) if format == "auto" else format
     if name == "scannet":
         return to_our_world(open_scan(path), settings, aligned=True)
-    source = _FORMATS[name].read(path)
-    scan = _FORMATS[name].open(source)
+    recording = _FORMATS[name].read(path)
+    scan = _FORMATS[name].open(recording)
     try:
-        return to_our_world(scan, settings, axes=source.axes, up=source.up, metric=source.metric)
+        return to_our_world(scan, settings, axes=recording.axes, up=recording.up, metric=recording.metric)
     except BaseException:
         scan.close()
         raise
@@ -82,7 +83,7 @@ def _recognised(path: Path) -> str:
         raise DataError(f"there is no scene {path}: check the path")
     if path.is_file() and path.suffix == ".sens":
         return "scannet"
-    fitting = [name for name, known in _FORMATS.items() if known.fits(path)]
+    fitting = [name for name, format in _FORMATS.items() if format.fits(path)]
     if path.is_dir() and _is_scannet(path):
         fitting.insert(0, "scannet")
     if len(fitting) > 1:

@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from raytran.capture.imported import Shot, Source, frame_name, images_in
-from raytran.capture.json_file import number, numbers, read_object
 from raytran.capture.lens import Lens, check_lens
+from raytran.capture.recording import Frame, Recording, frame_name, images_in, number, numbers, read_json
 from raytran.capture.trajectory import rotations
 from raytran.errors import DataError
 
@@ -24,12 +23,12 @@ _IMAGE_FOLDERS = ("rgb", "EXR_RGBD/rgb", "rgbd")
 
 def find_metadata(path: Path) -> Path | None:
     """Return Record3D's list of poses in a folder, or None."""
-    found = (path / name for name in _NAMES if (path / name).is_file())
-    images = any((path / name).is_dir() for name in _IMAGE_FOLDERS)
-    return next(found, None) if images else None
+    if not any((path / name).is_dir() for name in _IMAGE_FOLDERS):
+        return None
+    return next((path / name for name in _NAMES if (path / name).is_file()), None)
 
 
-def read_record3d(path: Path) -> Source:
+def read_record3d(path: Path) -> Recording:
     """Read an export of Record3D.
 
     Raises:
@@ -40,7 +39,7 @@ def read_record3d(path: Path) -> Source:
     listed = find_metadata(path)
     if listed is None:
         raise DataError(f"{path} holds no metadata.json with rgb/ or rgbd/ beside it: export it as EXR + JPG")
-    content = read_object(listed)
+    content = read_json(listed)
     where = str(listed)
     table = numbers(content, "poses", where, (-1, 7))
     folder = next(path / name for name in _IMAGE_FOLDERS if (path / name).is_dir())
@@ -53,11 +52,13 @@ def read_record3d(path: Path) -> Source:
     poses[:, :3, :3] = rotations(table[:, :4])
     poses[:, :3, 3] = table[:, 4:]
     lenses = _lenses(content, len(table), where)
-    shots = (
-        Shot(frame_name(image.name), image, pose, lens)
+    frames = (
+        Frame(frame_name(image.name), image, pose, lens)
         for image, pose, lens in zip(images, poses, lenses, strict=True)
     )
-    return Source(path=listed, scene_id=path.resolve().name, shots=tuple(shots), axes="opengl", metric=True)
+    return Recording(
+        path=listed, scene_id=path.resolve().name, frames=tuple(frames), axes="opengl", metric=True
+    )
 
 
 def _lenses(content: dict[str, Any], count: int, where: str) -> list[Lens]:
@@ -65,7 +66,7 @@ def _lenses(content: dict[str, Any], count: int, where: str) -> list[Lens]:
     if content.get("perFrameIntrinsicCoeffs"):
         table = numbers(content, "perFrameIntrinsicCoeffs", where, (count, 4))
     else:
-        # Column by column.
+        # K is written column by column.
         matrix = numbers(content, "K", where, (3, 3)).T
         table = np.tile(matrix[[0, 1, 0, 1], [0, 1, 2, 2]], (count, 1))
     return [check_lens(Lens(size, (fx, fy), (cx, cy)), where) for fx, fy, cx, cy in table.tolist()]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A video file with a pose track beside it, decoded by PyAV one wanted frame at a time."""
+"""Videos with a pose track beside them, decoded by PyAV one frame at a time."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from raytran.capture.imported import ImportedScan, Pictures, Shot, Source, assemble
+from raytran.capture.recording import Frame, FrameImages, RecordedScan, Recording, build_scan
 from raytran.capture.trajectory import (
     INTRINSICS_NAMES,
     TRACK_NAMES,
     Track,
-    are_known,
     poses_at,
     read_camera,
     read_track,
@@ -28,7 +27,7 @@ from raytran.errors import ConfigError, DataError
 VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
 
 _SEEK_FROM = 64
-"""Frames ahead for which the video is searched for a key frame rather than decoded on."""
+"""A frame this many or more ahead is reached from a key frame; a nearer one by decoding on."""
 
 
 class VideoFile:
@@ -58,13 +57,13 @@ class VideoFile:
             ) from error
         try:
             self._stream = self._first_stream()
-            self._shown = self._frame_times()
+            self._pts = self._frame_times()
         except BaseException:
             self._container.close()
             raise
-        self.times = (self._shown - self._shown[0]) * float(self._stream.time_base)
+        self.times = (self._pts - self._pts[0]) * float(self._stream.time_base)
         self._frames: Iterator[Any] = iter(())
-        self._next = len(self._shown)
+        self._next = len(self._pts)
 
     def close(self) -> None:
         """Close the file."""
@@ -76,22 +75,22 @@ class VideoFile:
         Raises:
             DataError: it cannot be decoded, or is of another size than the first.
         """
-        wanted = int(self._shown[number])
+        wanted = int(self._pts[number])
         try:
             if not self._next <= number < self._next + _SEEK_FROM:
                 self._container.seek(wanted, stream=self._stream, backward=True)
                 self._frames = self._container.decode(self._stream)
             for frame in self._frames:
                 if frame.pts is not None and frame.pts >= wanted:
-                    self._next = int(np.searchsorted(self._shown, frame.pts, side="right"))
+                    self._next = int(np.searchsorted(self._pts, frame.pts, side="right"))
                     return self._pixels(frame, number, wanted)
         except self._av.FFmpegError as error:
-            self._next = len(self._shown)
+            self._next = len(self._pts)
             raise DataError(
                 f"cannot decode frame {number} of {self.path} ({error.strerror or error}): copy or "
                 "export it again"
             ) from error
-        self._next = len(self._shown)
+        self._next = len(self._pts)
         raise DataError(f"{self.path} ends before frame {number}: copy or export it again")
 
     def _pixels(self, frame: Any, number: int, wanted: int) -> NDArray[np.uint8]:
@@ -114,8 +113,9 @@ class VideoFile:
         return stream
 
     def _frame_times(self) -> NDArray[np.int64]:
+        """Return the presentation time of every frame, in the stream's time base, without decoding."""
         try:
-            shown = [
+            pts = [
                 packet.pts
                 for packet in self._container.demux(self._stream)
                 if packet.pts is not None and not packet.is_discard
@@ -124,13 +124,13 @@ class VideoFile:
             raise DataError(
                 f"cannot read the video {self.path} ({error.strerror or error}): copy it again"
             ) from error
-        if not shown:
+        if not pts:
             raise DataError(f"{self.path} has no frames: copy or export it again")
-        return np.unique(np.array(shown, dtype=np.int64))
+        return np.unique(np.array(pts, dtype=np.int64))
 
 
-class VideoFrames(Pictures):
-    """Some frames of a video."""
+class VideoFrames(FrameImages):
+    """Images that are frames of a video."""
 
     def __init__(self, file: VideoFile, numbers: list[int]) -> None:
         self._file, self._numbers = file, numbers
@@ -138,7 +138,7 @@ class VideoFrames(Pictures):
     def read(
         self, index: int, image_size: tuple[int, int] | None, stored: tuple[int, int]
     ) -> NDArray[np.uint8]:
-        """See ``Pictures``."""
+        """See ``FrameImages``."""
         pixels = self._file.read(self._numbers[index])
         return pixels if image_size in (None, pixels.shape[:2]) else resize(pixels, image_size)
 
@@ -157,7 +157,7 @@ def find_video(path: Path) -> Path | None:
     return videos[0] if len(videos) == 1 else None
 
 
-def read_video(path: Path) -> Source:
+def read_video(path: Path) -> Recording:
     """Read the poses of a video's frames.
 
     Beside ``walk.mp4`` lie its poses, ``walk.txt`` or ``trajectory.txt``, and ``walk.intrinsics.txt`` or
@@ -178,27 +178,27 @@ def read_video(path: Path) -> Source:
         file.close()
     lens = read_camera(listed, image_size)
     poses = _poses(track, times, video)
-    posed = are_known(poses)
-    return Source(
+    has_pose = np.isfinite(poses).all(axis=(1, 2)).tolist()
+    return Recording(
         path=video,
         scene_id=video.stem,
-        shots=tuple(Shot(str(n), video, poses[n], lens, n) for n, good in enumerate(posed) if good),
-        dropped={str(n): NO_POSE for n, good in enumerate(posed) if not good},
+        frames=tuple(Frame(str(n), video, poses[n], lens, n) for n, known in enumerate(has_pose) if known),
+        dropped={str(n): NO_POSE for n, known in enumerate(has_pose) if not known},
     )
 
 
-def from_video(source: Source) -> ImportedScan:
-    """Return the scan of a source whose images are frames of one video.
+def open_video(recording: Recording) -> RecordedScan:
+    """Return the scan of a recording whose images are frames of one video.
 
     Raises:
-        DataError: see ``VideoFile`` and ``assemble``.
+        DataError: see ``VideoFile`` and ``build_scan``.
     """
-    file = VideoFile(source.path)
+    file = VideoFile(recording.path)
     try:
-        return assemble(
-            source,
-            lambda shot: file.image_size,
-            lambda shots: VideoFrames(file, [shot.number for shot in shots]),
+        return build_scan(
+            recording,
+            lambda frame: file.image_size,
+            lambda frames: VideoFrames(file, [frame.number for frame in frames]),
         )
     except BaseException:
         file.close()
@@ -215,7 +215,7 @@ def _poses(track: Track, times: NDArray[np.float64], video: Path) -> NDArray[np.
             )
         return track.world_from_camera
     poses = poses_at(track, times)
-    if not any(are_known(poses)):
+    if not np.isfinite(poses).all(axis=(1, 2)).any():
         raise DataError(
             f"{video} lasts from 0 to {times[-1]:.1f} s and the poses in {track.path.name} from "
             f"{track.times[0]:.1f} to {track.times[-1]:.1f} s: give times in seconds since the first frame"
@@ -224,11 +224,12 @@ def _poses(track: Track, times: NDArray[np.float64], video: Path) -> NDArray[np.
 
 
 def _beside(video: Path, names: tuple[str, ...], what: str) -> Path:
-    found = next((video.with_name(name) for name in names if video.with_name(name).is_file()), None)
-    if found is None:
+    """Return the first of some files in a video's folder."""
+    path = next((video.with_name(name) for name in names if video.with_name(name).is_file()), None)
+    if path is None:
         form = "`timestamp tx ty tz qx qy qz qw` lines" if what == "pose track" else "`fx fy cx cy`"
         raise DataError(f"{video} has no {what} beside it: write {form} to {video.with_name(names[0])}")
-    return found
+    return path
 
 
 def _pyav() -> Any:

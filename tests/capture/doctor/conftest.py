@@ -1,35 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One furnished room, and copies of it that are spoiled in one way each."""
+"""A walk with exact matches of points."""
 
 from __future__ import annotations
-
-import shutil
 
 import numpy as np
 import pytest
 
-from raytran.capture.doctor.matches import Matches, match_frames
-from raytran.capture.doctor.recording import Recording
-from raytran.data.scannet.scan import read_scan
-
-SCAN = "scene0000_00"
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-
-
-@pytest.fixture(scope="session")
-def recording(room):
-    return Recording.of(read_scan(room / "scannet" / "scans" / SCAN))
-
-
-@pytest.fixture(scope="session")
-def matches(recording):
-    return match_frames(recording.read_grey, len(recording))
-
-
-@pytest.fixture
-def copy(room, tmp_path):
-    """A copy of the room that may be spoiled."""
-    return shutil.copytree(room, tmp_path / "copy")
+from raytran.capture.doctor.matches import Matches
 
 
 @pytest.fixture(scope="session")
@@ -55,5 +32,5 @@ def walk():
         frames.append(np.tile([first, first + 1], (ahead.sum(), 1)))
         pixels.append(np.stack([pixel, seen[:, :2] / seen[:, 2:]], axis=1)[ahead])
         depths.append(depth[ahead])
-    found = Matches(np.concatenate(frames), np.concatenate(pixels), tolerance_px=0.5)
-    return poses, intrinsics, found, np.concatenate(depths)
+    matches = Matches(np.concatenate(frames), np.concatenate(pixels), tolerance_px=0.5)
+    return poses, intrinsics, matches, np.concatenate(depths)

@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from raytran.capture.doctor.camera_findings import NO_READING
-from raytran.capture.doctor.cameras import _axis_turns, read_cameras
+from raytran.capture.doctor.cameras import NO_READING, _axis_rotations, check_cameras
 from raytran.capture.doctor.finding import Correction
 from raytran.capture.doctor.matches import Matches
 
-from .conftest import OPENGL
+from ..forms import OPENGL
 
 
 def scaled(x, y):
@@ -44,19 +43,19 @@ def causes(reading):
     return [finding.cause for finding in reading.findings if finding.state == "fault"]
 
 
-def test_true_cameras_are_not_flagged(recording, matches):
-    reading = read_cameras(recording, matches)
+def test_true_cameras_are_not_flagged(raw, matches):
+    reading = check_cameras(raw, matches)
     assert causes(reading) == []
     assert not reading.correction.changes_cameras
     assert [finding.state for finding in reading.findings] == ["ok", "ok"]
 
 
 @pytest.mark.parametrize("cause", SPOILED_POSES)
-def test_spoiled_poses_are_named_and_mended(recording, matches, cause):
-    spoiled = replace(recording, stored=SPOILED_POSES[cause](recording.stored))
-    reading = read_cameras(spoiled, matches)
+def test_spoiled_poses_are_named_and_mended(raw, matches, cause):
+    spoiled = replace(raw, stored=SPOILED_POSES[cause](raw.stored))
+    reading = check_cameras(spoiled, matches)
     assert causes(reading) == [cause]
-    mended, true = reading.correction.apply(spoiled.stored), recording.stored
+    mended, true = reading.correction.apply(spoiled.stored), raw.stored
     # Up to a turn of the whole world, to which images are blind.
     relative = np.linalg.inv(mended[:-1]) @ mended[1:]
     np.testing.assert_allclose(relative, np.linalg.inv(true[:-1]) @ true[1:], atol=1e-8)
@@ -65,50 +64,46 @@ def test_spoiled_poses_are_named_and_mended(recording, matches, cause):
 @pytest.mark.parametrize(
     ("cause", "spoil"), [(cause, spoil) for cause, spoils in SPOILED_INTRINSICS.items() for spoil in spoils]
 )
-def test_spoiled_intrinsics_are_named_and_mended(recording, matches, cause, spoil):
-    reading = read_cameras(replace(recording, intrinsics=spoil(recording.intrinsics)), matches)
+def test_spoiled_intrinsics_are_named_and_mended(raw, matches, cause, spoil):
+    reading = check_cameras(replace(raw, intrinsics=spoil(raw.intrinsics)), matches)
     assert causes(reading) == [cause]
     mended = reading.correction.intrinsics
-    np.testing.assert_allclose(np.diag(mended)[:2], np.diag(recording.intrinsics)[:2], rtol=0.05)
+    np.testing.assert_allclose(np.diag(mended)[:2], np.diag(raw.intrinsics)[:2], rtol=0.05)
     assert "multiply" in reading.findings[1].fix or "give fx" in reading.findings[1].fix
 
 
-def test_poses_and_intrinsics_may_be_wrong_together(recording, matches):
-    spoiled = replace(
-        recording, stored=recording.stored @ OPENGL, intrinsics=scaled(2.025, 2.0167)(recording.intrinsics)
-    )
-    assert causes(read_cameras(spoiled, matches)) == [
+def test_poses_and_intrinsics_may_be_wrong_together(raw, matches):
+    spoiled = replace(raw, stored=raw.stored @ OPENGL, intrinsics=scaled(2.025, 2.0167)(raw.intrinsics))
+    assert causes(check_cameras(spoiled, matches)) == [
         "OpenGL camera axes",
         "intrinsics for another image size",
     ]
 
 
-def test_any_turn_of_the_axes_is_found(recording, walk):
+def test_any_turn_of_the_axes_is_found(raw, walk):
     poses, intrinsics, matches, _ = walk
-    turns = _axis_turns()
+    turns = _axis_rotations()
     assert len(turns) == 24
     assert len({turn.tobytes() for turn in turns}) == 24
     for turn in turns[::3]:
         spoiled = poses.copy()
         spoiled[:, :3, :3] = poses[:, :3, :3] @ turn.T
-        reading = read_cameras(replace(recording, stored=spoiled, intrinsics=intrinsics), matches)
+        reading = check_cameras(replace(raw, stored=spoiled, intrinsics=intrinsics), matches)
         np.testing.assert_array_equal(reading.correction.apply(spoiled), poses)
         assert reading.agrees.all()
 
 
-def test_poses_of_other_frames_are_no_reading(recording, matches):
+def test_poses_of_other_frames_are_no_reading(raw, matches):
     rng = np.random.default_rng(0)
-    mixed = recording.stored[rng.permutation(len(recording))]
-    reading = read_cameras(replace(recording, stored=mixed), matches)
+    mixed = raw.stored[rng.permutation(len(raw))]
+    reading = check_cameras(replace(raw, stored=mixed), matches)
     assert causes(reading) == [NO_READING]
     assert reading.findings[1].state == "unknown"
 
 
-def test_few_matches_tell_nothing(recording, matches):
+def test_few_matches_tell_nothing(raw, matches):
     few = Matches(matches.frame[:20], matches.pixel[:20], matches.tolerance_px)
-    reading = read_cameras(replace(recording, stored=np.linalg.inv(recording.stored)), few)
+    reading = check_cameras(replace(raw, stored=np.linalg.inv(raw.stored)), few)
     assert [finding.state for finding in reading.findings] == ["unknown", "unknown"]
-    assert (
-        reading.correction.apply(recording.stored).tolist() == Correction().apply(recording.stored).tolist()
-    )
+    assert reading.correction.apply(raw.stored).tolist() == Correction().apply(raw.stored).tolist()
     assert not reading.agrees.any()

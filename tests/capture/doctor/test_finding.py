@@ -8,7 +8,7 @@ import pytest
 
 from raytran.capture.doctor.finding import Correction
 
-from .conftest import OPENGL
+from ..forms import OPENGL
 
 
 def test_a_fresh_correction_changes_nothing(walk):
@@ -39,7 +39,7 @@ def test_turn_scale_and_world_are_applied_in_this_order(walk):
     poses = walk[0]
     stored = np.linalg.inv(OPENGL) @ poses
     stored[:, :3, 3] *= 100
-    correction = Correction(scale=0.01, world_turn=OPENGL)
+    correction = Correction(scale=0.01, world_transform=OPENGL)
     np.testing.assert_allclose(correction.apply(stored), poses, atol=1e-12)
     assert correction.changes_cameras
 

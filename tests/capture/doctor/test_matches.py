@@ -43,13 +43,13 @@ def test_rays_that_meet_behind_the_cameras_do_not_agree(walk):
     assert not triangulate(matches, backwards, intrinsics)[0].any()
 
 
-def test_points_of_real_images_agree_with_their_cameras(recording, matches):
+def test_points_of_real_images_agree_with_their_cameras(raw, matches):
     assert len(matches) > 200
-    agrees, depth = triangulate(matches, recording.stored, recording.intrinsics)
+    agrees, depth = triangulate(matches, raw.stored, raw.intrinsics)
     assert agrees.mean() > 0.8
     assert 0.8 < np.median(depth[agrees]) < 4.0
     assert (matches.frame[:, 0] != matches.frame[:, 1]).all()
-    height, width = recording.scan.image_size
+    height, width = raw.scan.image_size
     assert (matches.pixel > 0).all()
     assert (matches.pixel < (width, height)).all()
 

@@ -14,7 +14,7 @@ from raytran.capture.doctor.examine import examine
 from raytran.data.scan2cad import read_annotations
 from raytran.data.scannet.find import find_scans
 
-from .conftest import OPENGL
+from ..forms import OPENGL
 
 SCAN = "scene0470_00"
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of new cameras: which volume renders them, their size, and what is refused."""
+"""FrameImages of new cameras: which volume renders them, their size, and what is refused."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import torch
 from PIL import Image
 from torch import nn
 
-from raytran.capture.camera_list import CameraList
 from raytran.capture.lens import Lens
+from raytran.capture.render_cameras import RenderCameras
 from raytran.errors import ConfigError, DataError
 from raytran.geometry.volumes import Volumes
 from raytran.run.predict.new_views import cameras_to_render, render_views
@@ -52,11 +52,11 @@ def room(*centers: float) -> RoomViews:
     return RoomViews(views, tuple(map(str, range(count))), Volumes((8, 8, 4), (4, 4, 2), center), members)
 
 
-def cameras_at(*places: float, size: tuple[int, int] = (60, 80)) -> CameraList:
+def cameras_at(*places: float, size: tuple[int, int] = (60, 80)) -> RenderCameras:
     poses = AHEAD.double().repeat(len(places), 1, 1)
     poses[:, 0, 3] = torch.tensor(places)
     lens = Lens(size, (70.0, 70.0), (40.0, 30.0))
-    return CameraList(tuple(f"at {x:g}" for x in places), (lens,) * len(places), poses)
+    return RenderCameras(tuple(f"at {x:g}" for x in places), (lens,) * len(places), poses)
 
 
 def test_each_camera_is_rendered_from_the_volume_ahead_of_it(tmp_path, caplog):

@@ -94,7 +94,7 @@ def test_scans_may_be_chosen(rooms, asked):
     examinations, found = check_folder(rooms, scenes=["*02_00", "scene0000_00"])
     assert [examination.scene_id for examination in examinations] == ["scene0002_00", "scene0000_00"]
     assert found == 2
-    assert [e.scene_id for e in check_folder(rooms, most=2)[0]] == ["scene0000_00", "scene0002_00"]
+    assert [e.scene_id for e in check_folder(rooms, max_scans=2)[0]] == ["scene0000_00", "scene0002_00"]
 
 
 def test_mistakes_of_the_user_are_named(rooms, tmp_path):

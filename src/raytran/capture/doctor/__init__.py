@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Is a scan right? Each reading of its files is held against what the images, depths and CADs say."""
+"""The data doctor: checks a scan's cameras and annotation against its images, depth maps and CADs."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same points found in two frames, by the images alone, and how well cameras explain them."""
+"""Points matched between frames by their images alone, and whether cameras explain the matches."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ _TOLERANCE_PX = 1.5
 
 _NUM_POINTS = 600
 _NUM_STARTS = 14
-_WANTED = 1500
+_ENOUGH = 1500
 """Matches after which no more frames are compared."""
 
-_FEWEST = 15
+_MIN_PER_PAIR = 15
 """Matches below which a pair of frames does not count: they show different places, or blur."""
 
-_LEAST_MOTION = 0.03
+_MIN_MOTION = 0.03
 """Median shift of a pair's matches, image widths; a smaller one says little about depth."""
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Points seen twice.
+    """n points, each in two frames.
 
     Attributes:
         frame: ``(n, 2)`` positions of the two frames in the scan.
@@ -57,43 +57,45 @@ def match_frames(read_grey: Callable[[int, int], tuple[NDArray, float]], num_fra
         num_frames: frames of the scan.
     """
     matcher = _Matcher(read_grey)
-    gap, found = 1, 0
-    parts: list[tuple[int, int, NDArray]] = []
-    starts = (
-        np.linspace(0, max(num_frames - 2, 0), min(_NUM_STARTS, max(num_frames - 1, 0))).round().astype(int)
-    )
-    order = np.argsort([int(f"{i:08b}"[::-1], 2) for i in range(len(starts))], kind="stable")
-    for start in starts[order].tolist():
+    gap, count = 1, 0
+    pairs: list[tuple[int, int, NDArray]] = []
+    for start in _spread_starts(num_frames):
         for _ in range(3):
             stop = start + gap if start + gap < num_frames else start - gap
             if stop < 0:
                 gap = max(1, gap // 2)
                 continue
             pixels = matcher.match(start, stop)
-            shift = (
-                float(np.median(np.linalg.norm(pixels[:, 0] - pixels[:, 1], axis=1))) if len(pixels) else 0.0
-            )
-            if len(pixels) < _FEWEST:
+            if len(pixels) < _MIN_PER_PAIR:
                 gap = max(1, gap // 2)
-            elif shift < _LEAST_MOTION * matcher.width:
+            elif np.median(np.linalg.norm(pixels[:, 0] - pixels[:, 1], axis=1)) < _MIN_MOTION * matcher.width:
                 gap *= 2
             else:
-                parts.append((start, stop, pixels))
-                found += len(pixels)
+                pairs.append((start, stop, pixels))
+                count += len(pixels)
                 break
-        if found >= _WANTED:
+        if count >= _ENOUGH:
             break
-    frames = [np.tile([[a, b]], (len(pixels), 1)) for a, b, pixels in parts]
     tolerance = _TOLERANCE_PX / matcher.factor
-    if not parts:
+    if not pairs:
         return Matches(np.zeros((0, 2), np.int64), np.zeros((0, 2, 2)), tolerance)
-    return Matches(np.concatenate(frames), np.concatenate([pixels for *_, pixels in parts]), tolerance)
+    frames = np.concatenate([np.tile([[a, b]], (len(pixels), 1)) for a, b, pixels in pairs])
+    return Matches(frames, np.concatenate([pixels for *_, pixels in pairs]), tolerance)
+
+
+def _spread_starts(num_frames: int) -> list[int]:
+    """Return frames spread evenly over a scan, ordered so that the first few are spread too."""
+    count = min(_NUM_STARTS, max(num_frames - 1, 0))
+    starts = np.linspace(0, max(num_frames - 2, 0), count).round().astype(int)
+    # By the reversed bits of their numbers (van der Corput's sequence).
+    order = np.argsort([int(f"{i:08b}"[::-1], 2) for i in range(count)], kind="stable")
+    return starts[order].tolist()
 
 
 def triangulate(
     matches: Matches, world_from_camera: NDArray, intrinsics: NDArray
 ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-    """Say which matches the cameras explain, and how far away their points are.
+    """Return which matches the cameras explain, and how far away their points are.
 
     A match agrees if its Sampson distance (Hartley & Zisserman 2004, §11.4.3) is within the tolerance and the
     two rays pass each other in front of both cameras.
@@ -108,41 +110,45 @@ def triangulate(
     """
     first, second = world_from_camera[matches.frame[:, 0]], world_from_camera[matches.frame[:, 1]]
     relative = np.linalg.inv(second) @ first
-    turn, shift = relative[:, :3, :3], relative[:, :3, 3]
+    rotation, translation = relative[:, :3, :3], relative[:, :3, 3]
     rays = np.concatenate([matches.pixel, np.ones((*matches.pixel.shape[:2], 1))], axis=2)
     rays = rays @ np.linalg.inv(intrinsics).T
-    one, two = np.einsum("nij,nj->ni", turn, rays[:, 0]), rays[:, 1]
-    line = np.cross(shift, one)
-    residual = np.abs((line * two).sum(axis=1))
-    back = np.einsum("nji,nj->ni", turn, np.cross(two, shift))
+    # Both rays in the axes of the second camera.
+    first_ray, second_ray = np.einsum("nij,nj->ni", rotation, rays[:, 0]), rays[:, 1]
+    # Sampson distance: the epipolar residual over its slope in the pixels of both images.
+    line = np.cross(translation, first_ray)
+    residual = np.abs((line * second_ray).sum(axis=1))
+    line_in_first = np.einsum("nji,nj->ni", rotation, np.cross(second_ray, translation))
     focal = np.array([intrinsics[0, 0], intrinsics[1, 1]])
-    slope = np.concatenate([line[:, :2] / focal, back[:, :2] / focal], axis=1)
+    slope = np.concatenate([line[:, :2] / focal, line_in_first[:, :2] / focal], axis=1)
     distance = residual / np.maximum(np.linalg.norm(slope, axis=1), 1e-12)
-    across = np.cross(one, two)
-    square = np.maximum((across**2).sum(axis=1), 1e-12)
-    depth_one = (np.cross(two, shift) * across).sum(axis=1) / square
-    depth_two = (np.cross(one, shift) * across).sum(axis=1) / square
-    return (distance < matches.tolerance_px) & (depth_one > 0) & (depth_two > 0), depth_one
+    # Depths at which the rays are closest to each other.
+    normal = np.cross(first_ray, second_ray)
+    square = np.maximum((normal**2).sum(axis=1), 1e-12)
+    first_depth = (np.cross(second_ray, translation) * normal).sum(axis=1) / square
+    second_depth = (np.cross(first_ray, translation) * normal).sum(axis=1) / square
+    in_front = (first_depth > 0) & (second_depth > 0)
+    return (distance < matches.tolerance_px) & in_front, first_depth
 
 
 class _Matcher:
-    """Finds points once per frame."""
+    """Matches ORB features (Rublee et al. 2011) of two frames; those of a frame are computed once."""
 
     def __init__(self, read_grey: Callable[[int, int], tuple[NDArray, float]]) -> None:
         self._read_grey = read_grey
-        self._points: dict[int, tuple[NDArray, NDArray]] = {}
+        self._features: dict[int, tuple[NDArray, NDArray]] = {}
         self.factor, self.width = 1.0, _WIDTH
 
     def match(self, first: int, second: int) -> NDArray[np.float64]:
         """Return ``(n, 2, 2)`` matched pixels of two frames, at the stored size."""
-        (a, code_a), (b, code_b) = self._find(first), self._find(second)
-        if len(a) < _FEWEST or len(b) < _FEWEST:
+        (a, descriptors_a), (b, descriptors_b) = self._features_of(first), self._features_of(second)
+        if len(a) < _MIN_PER_PAIR or len(b) < _MIN_PER_PAIR:
             return np.zeros((0, 2, 2))
-        pairs = match_descriptors(code_a, code_b, cross_check=True, max_ratio=0.8)
+        pairs = match_descriptors(descriptors_a, descriptors_b, cross_check=True, max_ratio=0.8)
         return np.stack([a[pairs[:, 0]], b[pairs[:, 1]]], axis=1)
 
-    def _find(self, frame: int) -> tuple[NDArray, NDArray]:
-        if frame not in self._points:
+    def _features_of(self, frame: int) -> tuple[NDArray, NDArray]:
+        if frame not in self._features:
             grey, self.factor = self._read_grey(frame, _WIDTH)
             self.width = round(grey.shape[1] / self.factor)
             detector = ORB(n_keypoints=_NUM_POINTS, fast_threshold=0.04)
@@ -150,8 +156,8 @@ class _Matcher:
                 detector.detect_and_extract(grey)
                 # Points are given as (row, column) of pixel centres; (0, 0) is the corner of the image here.
                 points = (detector.keypoints[:, ::-1] + 0.5) / self.factor
-                self._points[frame] = points, detector.descriptors
+                self._features[frame] = points, detector.descriptors
             except (RuntimeError, ValueError, IndexError):
                 # What scikit-image raises when an image has no corners.
-                self._points[frame] = np.zeros((0, 2)), np.zeros((0, 256), dtype=bool)
-        return self._points[frame]
+                self._features[frame] = np.zeros((0, 2)), np.zeros((0, 256), dtype=bool)
+        return self._features[frame]

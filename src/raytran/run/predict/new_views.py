@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from raytran.capture.camera_list import CameraList, read_camera_list
+from raytran.capture.render_cameras import RenderCameras, read_render_cameras
 from raytran.data.files import finished_folder
 from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
@@ -24,17 +24,17 @@ NEW_VIEWS = "new_views"
 _log = logging.getLogger(__name__)
 
 
-def cameras_to_render(path: str | None, model: RayTran, checkpoint: str) -> CameraList | None:
+def cameras_to_render(path: str | None, model: RayTran, checkpoint: str) -> RenderCameras | None:
     """Return the cameras that a list names, None without a list.
 
     Args:
-        path: the list, see ``read_camera_list``; or None.
+        path: the list, see ``read_render_cameras``; or None.
         model: the network that is to render them.
         checkpoint: where it comes from, for messages.
 
     Raises:
         ConfigError: the network cannot render.
-        DataError: see ``read_camera_list``.
+        DataError: see ``read_render_cameras``.
     """
     if path is None:
         return None
@@ -43,13 +43,13 @@ def cameras_to_render(path: str | None, model: RayTran, checkpoint: str) -> Came
             f"{checkpoint} cannot render views={path}: give a checkpoint that was trained with "
             "experiment=novel_view, or leave views= out"
         )
-    return read_camera_list(Path(path))
+    return read_render_cameras(Path(path))
 
 
 def render_views(
     model: RayTran,
     room: RoomViews,
-    wanted: CameraList,
+    wanted: RenderCameras,
     output: Path,
     *,
     views_at_once: int | None = None,

@@ -13,7 +13,7 @@ from omegaconf import DictConfig
 
 from raytran.backbone.observed import observe_attention
 from raytran.capture.open import open_scene
-from raytran.capture.orient import WorldSettings
+from raytran.capture.orientation import WorldSettings
 from raytran.checkpoints.load import PredictionSettings, load_model, prediction_settings
 from raytran.checkpoints.network import trusted_packages
 from raytran.data.shapenet.models import shapenet_version

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from raytran.capture.sharpness import blurred_frames
+from raytran.capture.frames import blurred_frames
 from raytran.data.images import MIN_VIEWS
 from raytran.data.scan import OpenScan, report_dropped, scan_views
 from raytran.data.views import choose_by_coverage, choose_even

@@ -14,7 +14,7 @@ from rich.progress import track
 from rich.table import Table
 
 from raytran.capture.doctor.examine import Examination, examine
-from raytran.capture.doctor.page import summary, write_doctor_page
+from raytran.capture.doctor.report import summary, write_doctor_page
 from raytran.data.scan2cad import SceneAnnotation, read_annotations
 from raytran.data.scannet.find import ScanSource, find_scans
 from raytran.errors import ConfigError, DataError
@@ -23,7 +23,7 @@ from raytran.run.train.build import plain
 _log = logging.getLogger(__name__)
 
 ANNOTATIONS = "full_annotations.json"
-_UPWARDS = 4
+_PARENTS = 4
 """How many folders above a scan its annotation is looked for: root/scannet/scans/<scan>."""
 
 
@@ -40,22 +40,24 @@ def check(cfg: DictConfig) -> bool:
     settings = plain(cfg)
     folder = Path(settings["check"])
     output = Path(settings.get("output") or f"doctor_{folder.resolve().name}.html")
-    most = settings["checks"]
-    if most < 1:
-        raise ConfigError(f"checks={most} is too few: give at least 1")
+    max_scans = settings["checks"]
+    if max_scans < 1:
+        raise ConfigError(f"checks={max_scans} is too few: give at least 1")
     across, along, up = (float(length) for length in settings["grid_extent"])
     named = {name: Path(settings[name]) for name in ("scan2cad", "shapenet") if settings.get(name)}
-    examinations, found = check_folder(
+    examinations, num_found = check_folder(
         folder,
         scenes=settings.get("scenes"),
-        most=most,
+        max_scans=max_scans,
         grid_extent=(across, along, up),
         **named,
     )
     page = output if output.suffix == ".html" else output / "doctor.html"
-    write_doctor_page(page, examinations, checked=folder, num_found=found, grid_extent=(across, along, up))
+    write_doctor_page(
+        page, examinations, checked=folder, num_found=num_found, grid_extent=(across, along, up)
+    )
     Console().print(_table(examinations))
-    _log.info("%s", summary(examinations, folder, found))
+    _log.info("%s", summary(examinations, folder, num_found))
     _log.info("wrote %s", page.resolve())
     if any(examination.faults for examination in examinations):
         raise SystemExit(1)
@@ -66,7 +68,7 @@ def check_folder(
     folder: Path,
     *,
     scenes: list[str] | None = None,
-    most: int = 10,
+    max_scans: int = 10,
     grid_extent: tuple[float, float, float] = (9.0, 9.0, 3.5),
     scan2cad: Path | None = None,
     shapenet: Path | None = None,
@@ -76,7 +78,7 @@ def check_folder(
     Args:
         folder: one scan, a folder of scans, or a data set with ``scannet``, ``shapenet`` and ``scan2cad``.
         scenes: names or patterns of the scans to examine; None: all.
-        most: examine no more than these many.
+        max_scans: examine no more than these many.
         grid_extent: of the model's volume, metres.
         scan2cad: annotation file or its folder; None: looked for around ``folder``.
         shapenet: folder of CADs; None: looked for around ``folder``.
@@ -87,14 +89,14 @@ def check_folder(
     Raises:
         DataError: there is no scan, or a named one is not there.
     """
-    found = find_scans(folder)
+    scans = find_scans(folder)
     if scenes:
-        missing = [pattern for pattern in scenes if not fnmatch.filter(found, pattern)]
+        missing = [pattern for pattern in scenes if not fnmatch.filter(scans, pattern)]
         if missing:
-            raise DataError(f"{missing[0]} is not among the {len(found)} scans in {folder}: mend scenes=")
-        found = {name: found[name] for pattern in scenes for name in fnmatch.filter(found, pattern)}
-    chosen = np.unique(np.linspace(0, len(found) - 1, min(most, len(found))).round().astype(int))
-    sources: list[ScanSource] = [list(found.values())[i][0] for i in chosen.tolist()]
+            raise DataError(f"{missing[0]} is not among the {len(scans)} scans in {folder}: mend scenes=")
+        scans = {name: scans[name] for pattern in scenes for name in fnmatch.filter(scans, pattern)}
+    chosen = np.unique(np.linspace(0, len(scans) - 1, min(max_scans, len(scans))).round().astype(int))
+    sources: list[ScanSource] = [list(scans.values())[i][0] for i in chosen.tolist()]
     annotations, shapenet = _annotations(folder, scan2cad), shapenet or _around(folder, "shapenet")
     console = Console(stderr=True)
     examinations = [
@@ -106,11 +108,11 @@ def check_folder(
         )
         for source in track(sources, "examining", console=console, disable=not console.is_terminal)
     ]
-    return examinations, len(found)
+    return examinations, len(scans)
 
 
 def _annotations(folder: Path, given: Path | None) -> dict[str, SceneAnnotation]:
-    """Return the annotation that was named, or that lies in or above the folder; none if there is none."""
+    """Return the scenes of the given annotation, or of one in or above the folder; empty if there is none."""
     if given is not None:
         return read_annotations(given / ANNOTATIONS if given.is_dir() else given)
     path = _around(folder, f"scan2cad/{ANNOTATIONS}") or _around(folder, ANNOTATIONS)
@@ -120,8 +122,8 @@ def _annotations(folder: Path, given: Path | None) -> dict[str, SceneAnnotation]
 def _around(folder: Path, name: str) -> Path | None:
     """Return ``name`` in a folder or one of those above it."""
     folder = folder.resolve()
-    places = (folder, *folder.parents[:_UPWARDS])
-    return next((place / name for place in places if (place / name).exists()), None)
+    candidates = (path / name for path in (folder, *folder.parents[:_PARENTS]))
+    return next((path for path in candidates if path.exists()), None)
 
 
 def _table(examinations: list[Examination]) -> Table:
@@ -130,12 +132,11 @@ def _table(examinations: list[Examination]) -> Table:
         table.add_column(name, overflow="fold")
     for examination in examinations:
         for finding in examination.faults:
-            sure = f" ({finding.confidence})" if finding.confidence else ""
-            row = (examination.scene_id, finding.check, f"{finding.cause}{sure}", finding.fix or finding.text)
-            table.add_row(*row)
+            confidence = f" ({finding.confidence})" if finding.confidence else ""
+            cause = f"{finding.cause}{confidence}"
+            table.add_row(examination.scene_id, finding.check, cause, finding.fix or finding.text)
         if not examination.faults:
-            open_ = [finding.check for finding in examination.findings if finding.state == "unknown"]
-            table.add_row(
-                examination.scene_id, "all", "right", f"cannot be told: {', '.join(open_)}" if open_ else ""
-            )
+            unknown = [finding.check for finding in examination.findings if finding.state == "unknown"]
+            text = f"cannot be told: {', '.join(unknown)}" if unknown else ""
+            table.add_row(examination.scene_id, "all", "right", text)
     return table

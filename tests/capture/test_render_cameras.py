@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from raytran.capture.camera_list import MOST, read_camera_list
+from raytran.capture.render_cameras import MAX_CAMERAS, read_render_cameras
 from raytran.errors import DataError
 
 POSE = [[1, 0, 0, 0.5], [0, 0, 1, -2.0], [0, -1, 0, 1.4], [0, 0, 0, 1]]
@@ -32,7 +32,7 @@ def write(tmp_path):
 def test_what_views_share_stands_once_and_a_view_may_differ(write):
     other = {"world_from_camera": np.ravel(POSE).tolist(), "image_size": [100, 200]}
     other["intrinsics"] = [[150, 0, 101], [0, 160, 49], [0, 0, 1]]
-    found = read_camera_list(write({**SHARED, "views": [VIEW, other]}))
+    found = read_render_cameras(write({**SHARED, "views": [VIEW, other]}))
     assert found.names == ("door", "001")
     assert [lens.size for lens in found.lenses] == [(480, 640), (100, 200)]
     assert torch.equal(found.world_from_camera, torch.tensor([POSE, POSE], dtype=torch.float64))
@@ -51,7 +51,7 @@ def test_nerfstudios_list_comes_in_opencv_axes(write):
     opengl[:3, 1:3] *= -1
     frame = {"file_path": "images/1.jpg", "transform_matrix": opengl.tolist()}
     lens = {"w": 640, "h": 480, "fl_x": 500, "fl_y": 510, "cx": 320, "cy": 240, "k1": 0.1}
-    found = read_camera_list(write({**lens, "frames": [frame, {**frame, "fl_x": 400}]}))
+    found = read_render_cameras(write({**lens, "frames": [frame, {**frame, "fl_x": 400}]}))
     assert found.names == ("000", "001")
     assert [one.focal for one in found.lenses] == [(500, 510), (400, 510)]
     assert all(one.is_pinhole for one in found.lenses)
@@ -60,7 +60,7 @@ def test_nerfstudios_list_comes_in_opencv_axes(write):
     moved[:3] = moved[[1, 0, 2]]
     moved[2, :] *= -1
     applied = [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
-    undone = read_camera_list(
+    undone = read_render_cameras(
         write({**lens, "applied_transform": applied, "frames": [{"transform_matrix": moved.tolist()}]})
     )
     torch.testing.assert_close(undone.world_from_camera[0], torch.tensor(POSE, dtype=torch.float64))
@@ -75,7 +75,10 @@ def test_nerfstudios_list_comes_in_opencv_axes(write):
         ({"views": []}, "lists no cameras under views"),
         ({"views": [3]}, "lists no cameras under views"),
         ({"frames": {}}, "lists no cameras under frames"),
-        ({**SHARED, "views": [VIEW] * (MOST + 1)}, f"lists {MOST + 1} cameras, at most {MOST}"),
+        (
+            {**SHARED, "views": [VIEW] * (MAX_CAMERAS + 1)},
+            f"lists {MAX_CAMERAS + 1} cameras, at most {MAX_CAMERAS}",
+        ),
         ({"views": [VIEW]}, r"views\[0\] of .*cameras\.json has no image_size: write \[height, width\]"),
         ({**SHARED, "image_size": [480], "views": [VIEW]}, "has no image_size"),
         ({**SHARED, "image_size": [480, 100_000], "views": [VIEW]}, "8192 pixels a side"),
@@ -103,13 +106,13 @@ def test_nerfstudios_list_comes_in_opencv_axes(write):
 )
 def test_each_mistake_is_one_sentence(content, message, write):
     with pytest.raises(DataError, match=message) as refused:
-        read_camera_list(write(content))
+        read_render_cameras(write(content))
     assert "\n" not in str(refused.value)
 
 
 def test_the_lists_that_are_shown_can_be_read(project_root, write):
     shown = re.findall(r"```json\n(.*?)```", (project_root / "docs" / "novel-view.md").read_text(), re.DOTALL)
-    first, second = (read_camera_list(write(block)) for block in shown)
+    first, second = (read_render_cameras(write(block)) for block in shown)
     assert first.names == ("door", "001")
     assert [lens.size for lens in first.lenses] == [(480, 640), (600, 600)]
     # The same camera in both forms.
@@ -119,4 +122,4 @@ def test_the_lists_that_are_shown_can_be_read(project_root, write):
 
 def test_a_missing_list(tmp_path):
     with pytest.raises(DataError, match="check the path"):
-        read_camera_list(tmp_path / "none.json")
+        read_render_cameras(tmp_path / "none.json")

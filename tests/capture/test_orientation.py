@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Worlds with other axes and units: found, given, or said; and images that show what the poses hide."""
+"""Axes, up and unit: measured, checked, corrected or reported; and images that were stored sideways."""
 
 from __future__ import annotations
 
@@ -11,10 +11,18 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from raytran.capture.colmap import read_colmap
-from raytran.capture.imported import from_files
-from raytran.capture.orient import WorldSettings, to_our_world
+from raytran.capture.orientation import (
+    WorldSettings,
+    check_unit,
+    check_up,
+    rotate_upright,
+    rotation_to_z,
+    to_our_world,
+)
+from raytran.capture.recording import open_recording
 from raytran.data.scannet.scan import read_scan
 from raytran.errors import ConfigError
+from raytran.geometry.camera import Cameras
 
 from .forms import OPENGL, write_colmap
 
@@ -25,7 +33,7 @@ Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 @pytest.fixture
 def scan(walk):
     write_colmap(walk, walk.folder / "sparse" / "0", binary=True)
-    return from_files(read_colmap(walk.folder))
+    return open_recording(read_colmap(walk.folder))
 
 
 @pytest.fixture(scope="module")
@@ -197,3 +205,156 @@ def test_millimetres_are_said_and_not_mended(furnished, caplog):
 def test_unknown_settings(values, message):
     with pytest.raises(ConfigError, match=message):
         WorldSettings(**values)
+
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def rolled(scan, quarters):
+    """The same scan with the camera held rotated by quarter turns, clockwise seen from behind."""
+    poses = scan.world_from_camera.clone()
+    angle = torch.tensor(quarters * torch.pi / 2, dtype=torch.float64)
+    roll = torch.eye(3, dtype=torch.float64)
+    roll[:2, :2] = torch.tensor([[angle.cos(), -angle.sin()], [angle.sin(), angle.cos()]])
+    poses[:, :3, :3] = poses[:, :3, :3] @ roll
+    return replace(scan, world_from_camera=poses)
+
+
+def test_an_upright_scan_is_left_alone(scan):
+    assert rotate_upright(scan, UP) is scan
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_images_and_cameras_are_turned_together(scan, quarters):
+    sideways = rolled(scan, quarters)
+    upright = rotate_upright(sideways, UP)
+    assert upright.image_size == ((64, 48) if quarters % 2 else (48, 64))
+    tops = -upright.world_from_camera[:, 2, 1]
+    assert float(tops.min()) > 0.9
+    # A pixel of the stored image is found where its point of the world is seen in the turned one.
+    images = [np.zeros((48, 64, 3), np.uint8) for _ in range(12)]
+    pixel = (13, 50)
+    images[4][pixel] = 255
+    object.__setattr__(sideways, "images", type("", (), {"read": lambda self, i, *_: images[i]})())
+    row, column = (int(value[0]) for value in np.nonzero(upright.read_color(4)[..., 0]))
+    ray = torch.tensor([pixel[1] + 0.5, pixel[0] + 0.5, 1.0], dtype=torch.float64)
+    pose = sideways.world_from_camera[4]
+    point = pose[:3, :3] @ torch.linalg.inv(sideways.intrinsics) @ (2 * ray) + pose[:3, 3]
+    cameras = Cameras(upright.intrinsics, upright.world_from_camera[4], upright.image_size)
+    seen, depth = cameras.project(point[None])
+    assert seen[0].tolist() == pytest.approx([column + 0.5, row + 0.5])
+    assert depth.item() == pytest.approx(2.0)
+
+
+def test_sizes_are_those_of_the_turned_image(scan):
+    upright = rotate_upright(rolled(scan, 1), UP)
+    assert upright.read_color(3).shape == (64, 48, 3)
+    assert upright.read_color(3, (32, 20)).shape == (32, 20, 3)
+    assert upright.color_bytes(3) is None
+    assert upright.path == scan.path
+
+
+def test_images_that_turn_in_all_ways_are_left_alone(scan):
+    poses = torch.cat([rolled(scan, q).world_from_camera[q::4] for q in range(4)])
+    mixed = replace(scan, world_from_camera=poses)
+    assert rotate_upright(mixed, UP) is mixed
+
+
+DISTANCES = np.random.default_rng(0).uniform(1, 4, 200)
+
+
+@pytest.mark.parametrize(
+    ("factor", "cause", "metres"),
+    [(100, "positions in centimetres", 0.01), (1000, "positions in millimetres", 0.001)],
+)
+@pytest.mark.parametrize("with_maps", [False, True])
+def test_other_units_are_named(factor, cause, metres, with_maps):
+    measured = np.where(np.arange(200) % 3 > 0, DISTANCES * 1.1, np.nan) if with_maps else None
+    scale, finding = check_unit(DISTANCES * factor, measured)
+    assert scale == metres
+    assert (finding.state, finding.cause) == ("fault", cause)
+    assert finding.confidence == ("certain" if with_maps else "likely")
+    assert f"{metres}" in finding.fix
+
+
+def test_feet_need_depth_maps():
+    assert check_unit(DISTANCES * 3.2808, None)[1].state == "ok"
+    scale, finding = check_unit(DISTANCES * 3.2808, DISTANCES)
+    assert finding.cause == "positions in feet"
+    assert scale == 0.3048
+
+
+def test_a_scale_that_no_unit_explains_is_guessed_from_the_size_of_rooms():
+    scale, finding = check_unit(DISTANCES * 1e9, None)
+    assert finding.cause == "positions in no known unit"
+    assert 1 < np.median(DISTANCES) * 1e9 * scale < 5
+
+
+def test_an_arbitrary_scale_is_measured():
+    scale, finding = check_unit(DISTANCES * 1.7, DISTANCES)
+    assert finding.cause == "positions in no known unit"
+    assert scale == pytest.approx(1 / 1.7)
+
+
+def test_metres_are_right_and_few_points_tell_nothing():
+    metres, finding = check_unit(DISTANCES, None)
+    assert (metres, finding.state, finding.cause, finding.fix) == (1.0, "ok", "", "")
+    assert f"{np.median(DISTANCES):.3g} units away" in finding.text
+    metres, finding = check_unit(DISTANCES, DISTANCES * 1.15)
+    assert (metres, finding.state) == (1.0, "ok")
+    assert "times 1.15 are those of the depth maps (200 points)" in finding.text
+    metres, finding = check_unit(DISTANCES[:10] * 1000, None)
+    assert (metres, finding.state) == (1.0, "unknown")
+
+
+AXES = {"+y": (0, 1, 0), "-y": (0, -1, 0), "+x": (1, 0, 0), "-x": (-1, 0, 0), "-z": (0, 0, -1)}
+
+
+@pytest.mark.parametrize("name", AXES)
+def test_another_up_is_named_and_mended(walk, name):
+    turn = rotation_to_z(np.array(AXES[name], dtype=float))
+    np.testing.assert_allclose(turn @ AXES[name], [0, 0, 1], atol=1e-12)
+    assert np.linalg.det(turn) == pytest.approx(1)
+    lying = walk.poses.copy()
+    lying[:, :3] = turn.T @ lying[:, :3]
+    found, finding = check_up(lying)
+    np.testing.assert_array_equal(found, turn)
+    assert (finding.state, finding.cause, finding.confidence) == ("fault", f"wrong up ({name})", "certain")
+    assert str(turn.astype(int).tolist()) in finding.fix
+
+
+def test_a_level_walk_is_right_and_a_leaning_one_is_noted(walk):
+    assert check_up(walk.poses)[1].state == "ok"
+    lean = np.radians(20)
+    turn = np.array([[1, 0, 0], [0, np.cos(lean), -np.sin(lean)], [0, np.sin(lean), np.cos(lean)]])
+    leaning = walk.poses.copy()
+    leaning[:, :3] = turn @ leaning[:, :3]
+    turn, finding = check_up(leaning)
+    assert turn is None
+    assert finding.state == "note"
+    assert "20°" in finding.text
+
+
+def test_one_way_of_looking_tells_up_by_the_tops_of_the_images(walk):
+    still = np.tile(walk.poses[:1], (5, 1, 1))
+    turn, finding = check_up(still)
+    assert turn is None
+    assert finding.state == "ok"
+    still[:, :3] = np.diag([1.0, -1.0, -1.0]) @ still[:, :3]
+    assert check_up(still)[1].confidence == "likely"
+    down = np.radians(40)
+    pitch = np.array([[1, 0, 0], [0, np.cos(down), np.sin(down)], [0, -np.sin(down), np.cos(down)]])
+    looks_down = np.tile(walk.poses[:1], (5, 1, 1))
+    looks_down[:, :3, :3] = looks_down[:, :3, :3] @ pitch
+    assert check_up(looks_down)[1].state == "ok"
+
+
+def test_a_world_that_leans_far_is_levelled(walk):
+    lean = np.radians(60)
+    turn = np.array([[1, 0, 0], [0, np.cos(lean), -np.sin(lean)], [0, np.sin(lean), np.cos(lean)]])
+    leaning = walk.poses.copy()
+    leaning[:, :3] = turn @ leaning[:, :3]
+    found, finding = check_up(leaning)
+    assert finding.cause == "world not level"
+    np.testing.assert_allclose(found, turn.T, atol=0.05)
+    assert str(found.round(4).tolist()) in finding.fix

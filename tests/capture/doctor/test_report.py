@@ -14,12 +14,11 @@ import pytest
 import torch
 from PIL import Image
 
+from raytran.capture.doctor.depth import SurfacePoints
 from raytran.capture.doctor.examine import Examination
-from raytran.capture.doctor.figures import draw_frames, sight, telling_frames
 from raytran.capture.doctor.finding import Correction, Finding
-from raytran.capture.doctor.page import write_doctor_page
-from raytran.capture.doctor.recording import Recording
-from raytran.capture.doctor.sightings import Sightings
+from raytran.capture.doctor.report import camera_reading, draw_frames, frames_to_show, write_doctor_page
+from raytran.capture.frames import RawScan
 from raytran.data.scannet.scan import read_scan
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.structs import ObjectSet
@@ -42,10 +41,10 @@ def examination(tmp_path):
         folder / "intrinsic" / "intrinsic_color.txt",
         np.array([[120.0, 0, 80, 0], [0, 120, 60, 0], *np.eye(4)[2:]]),
     )
-    recording = Recording.of(read_scan(folder))
+    raw = RawScan.of(read_scan(folder))
     rng = np.random.default_rng(0)
     ends = np.c_[rng.uniform(-2, 2, 100), rng.uniform(1, 4, 100), np.zeros(100)]
-    way = (ends - recording.stored[0, :3, 3]) @ recording.stored[0, :3, :3]
+    way = (ends - raw.stored[0, :3, 3]) @ raw.stored[0, :3, :3]
     objects = replace(
         ObjectSet.empty(),
         label=torch.tensor([3]),
@@ -59,10 +58,10 @@ def examination(tmp_path):
         scene_id="scene0000_00",
         path=folder,
         findings=(Finding("camera axes", "ok", "all is well & good"),),
-        recording=recording,
-        sightings=Sightings(np.zeros(100, dtype=np.int64), way / way[:, 2:], way[:, 2], "a test"),
+        raw=raw,
+        surface=SurfacePoints(np.zeros(100, dtype=np.int64), way / way[:, 2:], way[:, 2], "a test"),
         objects=objects,
-        matches=123,
+        num_matches=123,
     )
 
 
@@ -105,7 +104,7 @@ def test_a_fault_comes_first_with_its_advice_and_pictures_of_both_readings(tmp_p
 
 
 def test_only_some_scans_have_pictures(tmp_path, faulty, monkeypatch):
-    monkeypatch.setattr("raytran.capture.doctor.page._PICTURED", 2)
+    monkeypatch.setattr("raytran.capture.doctor.report._MAX_PICTURED", 2)
     many = [replace(faulty, scene_id=f"scene{n:04d}_00", correction=Correction()) for n in range(14)]
     html = write(tmp_path, many, num_found=900)
     assert len(pictures(html)) == 2 * 4
@@ -121,8 +120,8 @@ def test_a_scan_that_cannot_be_opened_is_listed(tmp_path):
 
 
 def test_frames_show_the_floor_and_the_box(examination):
-    seen = sight(examination, examination.recording, corrected=False)
-    content = draw_frames(examination, examination.recording, seen, [0])[0]
+    seen = camera_reading(examination, examination.raw, corrected=False)
+    content = draw_frames(examination, examination.raw, seen, [0])[0]
     picture = np.asarray(Image.open(BytesIO(content)).convert("RGB")).astype(int)
     assert picture.shape == (360, 480, 3)
     # The floor lies one metre below the camera: nothing of it is above the horizon, its net is below.
@@ -137,17 +136,17 @@ def test_frames_show_the_floor_and_the_box(examination):
 
 
 def test_the_telling_frames_are_those_that_see_boxes(examination):
-    seen = sight(examination, examination.recording, corrected=False)
-    assert telling_frames(examination, seen, (120, 160), 3) == [0, 2, 4]
+    seen = camera_reading(examination, examination.raw, corrected=False)
+    assert frames_to_show(examination, seen, (120, 160), 3) == [0, 2, 4]
     away = seen.world_from_camera.copy()
     away[[0, 2, 3], :3, :3] = away[0, :3, :3] @ np.diag([-1.0, 1, -1])
     turned = replace(seen, world_from_camera=away)
-    assert telling_frames(examination, turned, (120, 160), 2) == [1, 4]
+    assert frames_to_show(examination, turned, (120, 160), 2) == [1, 4]
 
 
 def test_corrected_cameras_see_points_in_metres(faulty):
-    stored = sight(faulty, faulty.recording, corrected=False)
-    right = sight(faulty, faulty.recording, corrected=True)
+    stored = camera_reading(faulty, faulty.raw, corrected=False)
+    right = camera_reading(faulty, faulty.raw, corrected=True)
     np.testing.assert_allclose(right.world_from_camera[:, :3, 3], stored.world_from_camera[:, :3, 3] / 100)
     distance = [np.linalg.norm(s.points - s.world_from_camera[0, :3, 3], axis=1) for s in (stored, right)]
     np.testing.assert_allclose(distance[0], 100 * distance[1])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras without images, from which a scene is to be rendered: our own list, or nerfstudio's."""
+"""Cameras from which a scene is to be rendered, listed in our own form or in nerfstudio's."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from raytran.capture.json_file import numbers, read_object
 from raytran.capture.lens import Lens, check_lens
 from raytran.capture.nerfstudio import frame_lens, frame_pose, undo_applied
-from raytran.capture.orient import OPENGL
+from raytran.capture.orientation import OPENGL
+from raytran.capture.recording import numbers, read_json
 from raytran.data.scannet.text import are_rigid
 from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
 
-MOST = 10_000
-"""More cameras than this are a mistake."""
+MAX_CAMERAS = 10_000
+"""A list of more is taken for a mistake."""
 
-_NAME = re.compile(r"[\w-][\w. -]{0,99}")
-"""What may serve as a file name everywhere."""
+_FILE_NAME = re.compile(r"[\w-][\w. -]{0,99}")
+"""Names that every file system accepts."""
 
 
 @dataclass(frozen=True)
-class CameraList:
-    """V cameras, each with a name and the size of its image.
+class RenderCameras:
+    """V cameras without images, each with a name and the size of its image.
 
     Attributes:
-        names: different ones, fit for file names.
-        lenses: of each, for the size of its image.
+        names: of the cameras, all different, fit for file names.
+        lenses: V pinholes, for the size of each image.
         world_from_camera: ``(V, 4, 4)`` float64, OpenCV axes, metres.
     """
 
@@ -52,7 +52,7 @@ class CameraList:
         return Cameras(matrices.float(), self.world_from_camera.float(), image_size)
 
 
-def read_camera_list(path: Path) -> CameraList:
+def read_render_cameras(path: Path) -> RenderCameras:
     """Read a list of cameras; docs/novel-view.md describes both forms.
 
     Our own has ``views``, each with ``world_from_camera`` (4×4, OpenCV axes), ``intrinsics`` (3×3, or fx, fy,
@@ -60,37 +60,41 @@ def read_camera_list(path: Path) -> CameraList:
     beside ``views``. nerfstudio's has ``frames``; distortion is left out.
 
     Raises:
-        DataError: the file is missing, damaged, or lists no cameras; or a camera is none.
+        DataError: the file is missing, damaged, or lists no cameras; or an entry is no valid camera.
     """
     path = Path(path)
-    content = read_object(path)
+    content = read_json(path)
     if "views" not in content and "frames" not in content:
         raise DataError(f"{path} has neither views nor frames: write cameras as docs/novel-view.md shows")
     key = "views" if "views" in content else "frames"
     listed = content[key]
-    if not isinstance(listed, list) or not listed or not all(isinstance(one, dict) for one in listed):
+    if not isinstance(listed, list) or not listed or not all(isinstance(entry, dict) for entry in listed):
         raise DataError(f"{path} lists no cameras under {key}: write at least one, as an object")
-    if len(listed) > MOST:
-        raise DataError(f"{path} lists {len(listed)} cameras, at most {MOST} are rendered: divide the list")
-    places = [f"{key}[{index}] of {path}" for index in range(len(listed))]
-    facts = [{**content, **one} for one in listed]
+    if len(listed) > MAX_CAMERAS:
+        raise DataError(
+            f"{path} lists {len(listed)} cameras, at most {MAX_CAMERAS} are rendered: divide the list"
+        )
+    where = [f"{key}[{index}] of {path}" for index in range(len(listed))]
+    # What all cameras share may stand once, beside the list.
+    entries = [{**content, **entry} for entry in listed]
     if key == "views":
-        lenses = [_lens(one, place) for one, place in zip(facts, places, strict=True)]
+        lenses = [_lens(entry, name) for entry, name in zip(entries, where, strict=True)]
         poses = [
-            numbers(one, "world_from_camera", place, (4, 4)) for one, place in zip(facts, places, strict=True)
+            numbers(entry, "world_from_camera", name, (4, 4))
+            for entry, name in zip(entries, where, strict=True)
         ]
     else:
-        lenses, poses = _nerfstudio(content, facts, places, path)
-    return CameraList(_names(listed, places), tuple(lenses), torch.from_numpy(_rigid(poses, places)))
+        lenses, poses = _nerfstudio(content, entries, where, path)
+    return RenderCameras(_names(listed, where), tuple(lenses), torch.from_numpy(_checked_poses(poses, where)))
 
 
-def _lens(facts: Mapping[str, Any], where: str) -> Lens:
+def _lens(entry: Mapping[str, Any], where: str) -> Lens:
     try:
-        height, width = (int(side) for side in facts["image_size"])
+        height, width = (int(side) for side in entry["image_size"])
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{where} has no image_size: write [height, width] in pixels") from error
     try:
-        given = np.array(facts["intrinsics"], dtype=np.float64)
+        given = np.array(entry["intrinsics"], dtype=np.float64)
     except (KeyError, TypeError, ValueError) as error:
         raise DataError(f"{where} has no intrinsics: write [fx, fy, cx, cy] or a 3x3 matrix") from error
     if given.shape == (3, 3):
@@ -109,40 +113,40 @@ def _lens(facts: Mapping[str, Any], where: str) -> Lens:
 
 
 def _nerfstudio(
-    content: Mapping[str, Any], facts: Sequence[Mapping[str, Any]], places: Sequence[str], path: Path
+    content: Mapping[str, Any], entries: Sequence[Mapping[str, Any]], where: Sequence[str], path: Path
 ) -> tuple[list[Lens], list[NDArray[np.float64]]]:
     undo = undo_applied(content, path)
     lenses, poses = [], []
-    for one, place in zip(facts, places, strict=True):
-        lens = frame_lens(one, None, place)
-        lenses.append(Lens(lens.size, lens.focal, lens.center))
-        pose = frame_pose(one, undo, place)
+    for entry, name in zip(entries, where, strict=True):
+        lenses.append(frame_lens(entry, None, name, distorted=False))
+        pose = frame_pose(entry, undo, name)
         pose[:3, :3] = pose[:3, :3] @ OPENGL
         poses.append(pose)
     return lenses, poses
 
 
-def _rigid(poses: Sequence[NDArray[np.float64]], places: Sequence[str]) -> NDArray[np.float64]:
+def _checked_poses(poses: Sequence[NDArray[np.float64]], where: Sequence[str]) -> NDArray[np.float64]:
+    """Return poses as ``(V, 4, 4)``; refuse those that are no rigid motion."""
     stacked = np.array(poses)
-    for place, good in zip(places, are_rigid(stacked).tolist(), strict=True):
-        if not good:
+    for name, is_rigid in zip(where, are_rigid(stacked).tolist(), strict=True):
+        if not is_rigid:
             raise DataError(
-                f"{place} has a pose that is no rotation and place, or not finite: mend or remove it"
+                f"{name} has a pose that is no rotation and place, or not finite: mend or remove it"
             )
     stacked[:, 3] = [0, 0, 0, 1]
     return stacked
 
 
-def _names(listed: Sequence[Mapping[str, Any]], places: Sequence[str]) -> tuple[str, ...]:
+def _names(listed: Sequence[Mapping[str, Any]], where: Sequence[str]) -> tuple[str, ...]:
     """Return the given names, or numbers for those without."""
     digits = max(3, len(str(len(listed) - 1)))
-    names = [one.get("name", f"{index:0{digits}d}") for index, one in enumerate(listed)]
-    taken: dict[str, str] = {}
-    for name, place in zip(names, places, strict=True):
-        if not isinstance(name, str) or not _NAME.fullmatch(name) or name.endswith((".", " ")):
+    names = [entry.get("name", f"{index:0{digits}d}") for index, entry in enumerate(listed)]
+    used: dict[str, str] = {}
+    for name, place in zip(names, where, strict=True):
+        if not isinstance(name, str) or not _FILE_NAME.fullmatch(name) or name.endswith((".", " ")):
             raise DataError(f"{place} has the name {str(name)[:50]!r}, no file name: use letters and digits")
         # Some file systems take upper and lower case for the same.
-        if name.lower() in taken:
-            raise DataError(f"{place} has the name of {taken[name.lower()]}, {name!r}: give each its own")
-        taken[name.lower()] = place
+        if name.lower() in used:
+            raise DataError(f"{place} has the name of {used[name.lower()]}, {name!r}: give each its own")
+        used[name.lower()] = place
     return tuple(names)

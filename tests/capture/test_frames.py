@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blurred frames are told from sharp ones by their images."""
+"""Frames as they are stored: grey images, damaged ones, and blurred ones told from sharp ones."""
 
 from __future__ import annotations
 
@@ -8,8 +8,30 @@ import pytest
 from PIL import Image
 from scipy import ndimage
 
-from raytran.capture.sharpness import blurred_frames, sharpness
+from raytran.capture.frames import RawScan, blurred_frames, read_grey, sharpness
 from raytran.data.scannet.scan import read_scan
+
+from .forms import SCAN
+
+
+def test_grey_images_are_scaled_down_but_never_up(raw):
+    height, width = raw.scan.image_size
+    grey, factor = read_grey(raw.scan, 0, width // 2)
+    assert (grey.shape, factor) == ((height // 2, width // 2), 0.5)
+    assert 0 <= grey.min() < grey.max() <= 1
+    assert read_grey(raw.scan, 0, 4 * width)[1] == 1.0
+
+
+def test_damaged_images_are_named_and_read_as_black(copy):
+    raw = RawScan.of(read_scan(copy / "scannet" / "scans" / SCAN))
+    path = raw.scan.image_path[2]
+    path.write_bytes(path.read_bytes()[:300])
+    looked, failed = raw.unreadable_images(max_images=1000)
+    assert looked == len(raw)
+    assert len(failed) == 1
+    assert str(path) in failed[0]
+    assert not read_grey(raw.scan, 2, 100)[0].any()
+    assert raw.unreadable_images(max_images=5)[0] == 5
 
 
 def test_variance_of_the_laplacian():
