@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several scenes to one batch."""
+"""Joins several scenes to one batch."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def collate_scenes(samples: Sequence[SceneBatch]) -> SceneBatch:
     if len(shapes) > 1:
         raise ShapeError(f"expected scenes with images of one number and size, got {sorted(shapes)}")
     if len(samples) == 1:
-        # Spares a copy of all images.
+        # This saves a copy of all images.
         return samples[0]
     objects = [sample.objects for sample in samples]
     new_views = [sample.new_views for sample in samples]

@@ -27,17 +27,17 @@ from raytran.errors import ConfigError, DataError
 from raytran.geometry.camera import Cameras
 
 FACTS = "prepared.json"
-"""What became of a scan's frames; part of its prepared folder."""
+"""File in a prepared scan's folder that says what became of its frames."""
 
 JPEG_QUALITY = 90
-"""Of frames that were resized; ones that have the right size already keep their bytes."""
+"""Of resized frames; a frame that has the right size already keeps its bytes."""
 
 _PNG = b"\x89PNG"
 
 
 @dataclass(frozen=True)
 class PrepareSettings:
-    """What decides the bytes of a prepared scan.
+    """The settings on which the bytes of a prepared scan depend.
 
     Attributes:
         image_size: ``(H, W)`` of the frames.

@@ -58,19 +58,16 @@ def write_masks(entry: Entry, cameras: Cameras, output: Path) -> None:
     """
     objects = scene_objects(parse_entry(entry))
     cache = MaskCache(folder=output / "cache")
-    parts = zip(
-        cameras.intrinsics.float().split(_MASKS_AT_ONCE),
-        cameras.world_from_camera.float().split(_MASKS_AT_ONCE),
-        strict=True,
-    )
-    for part in parts:
-        foreground_masks(
-            objects, Cameras(*part, cameras.image_size), shapenet_root=output / "shapenet", cache=cache
+    for start in range(0, len(cameras.intrinsics), _MASKS_AT_ONCE):
+        frames = slice(start, start + _MASKS_AT_ONCE)
+        some = Cameras(
+            cameras.intrinsics[frames].float(), cameras.world_from_camera[frames].float(), cameras.image_size
         )
+        foreground_masks(objects, some, shapenet_root=output / "shapenet", cache=cache)
 
 
 def check_disk(error: BaseException, output: Path) -> None:
-    """Raise one sentence if ``error`` comes from a full or read-only disk.
+    """Raise an error for the user if ``error`` comes from a full or read-only disk.
 
     Raises:
         DataError: it does.
