@@ -50,6 +50,7 @@ def _join_views(parts: Sequence[Views]) -> Views:
     )
 
 
-def _join(parts: Sequence[Tensor | None]) -> Tensor | None:
-    present = [part for part in parts if part is not None]
-    return torch.cat(present) if len(present) == len(parts) else None
+def _join(tensors: Sequence[Tensor | None]) -> Tensor | None:
+    """Return the tensors joined along B, or None if a scene has none."""
+    present = [tensor for tensor in tensors if tensor is not None]
+    return torch.cat(present) if len(present) == len(tensors) else None

@@ -123,7 +123,7 @@ def _outside(output: Path, scans: Mapping[str, Sequence[ScanSource]]) -> dict[st
 
 
 def select_scans(
-    found: Mapping[str, Sequence[ScanSource]],
+    sources: Mapping[str, Sequence[ScanSource]],
     listed: Mapping[str, Sequence[str]],
     annotations: Annotations | None,
     *,
@@ -137,7 +137,7 @@ def select_scans(
     are no annotations at all.
 
     Args:
-        found: sources of each scan, best first.
+        sources: of each scan on disk, best first.
         listed: scans of each split file; empty if there are none, and then every scan counts.
         annotations: None if none are given.
         root: where scans were looked for.
@@ -152,15 +152,15 @@ def select_scans(
     if unknown:
         raise ConfigError(f"unknown splits {sorted(unknown)}: choose from {', '.join(SPLITS)}")
     lists = {split: list(listed.get(split, ())) for split in SPLITS if split in splits}
-    in_scope = {scan for scans in lists.values() for scan in scans} if listed else set(found)
+    in_scope = {scan for scans in lists.values() for scan in scans} if listed else set(sources)
     entries: Mapping[str, Entry] = {} if annotations is None else annotations.entries
     if scenes is not None:
-        in_scope &= set(_named(scenes, [*found, *entries], in_scope, root, splits))
-    chosen = sorted(in_scope & set(found))
+        in_scope &= set(_named(scenes, [*sources, *entries], in_scope, root, splits))
+    chosen = sorted(in_scope & set(sources))
     without_annotation = [scan for scan in chosen if annotations is not None and scan not in entries]
     skipped = without_annotation if scenes is None else []
     jobs = tuple(
-        ScanJob(scan, tuple(found[scan]), entries.get(scan)) for scan in chosen if scan not in skipped
+        ScanJob(scan, tuple(sources[scan]), entries.get(scan)) for scan in chosen if scan not in skipped
     )
     if not jobs:
         raise _nothing_left(set(chosen), root)
@@ -169,13 +169,13 @@ def select_scans(
         jobs=jobs,
         splits=lists if listed else {},
         without_annotation=without_annotation,
-        without_scan=sorted((in_scope if listed else set(entries)) & set(entries) - set(found)),
+        without_scan=sorted((in_scope if listed else set(entries)) & set(entries) - set(sources)),
         duplicates={
-            scan: [_described(source, root) for source in found[scan]]
+            scan: [_described(source, root) for source in sources[scan]]
             for scan in chosen
-            if len(found[scan]) > 1
+            if len(sources[scan]) > 1
         },
-        in_no_split=sorted(set(found) - in_lists) if listed else [],
+        in_no_split=sorted(set(sources) - in_lists) if listed else [],
     )
 
 

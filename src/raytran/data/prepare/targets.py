@@ -19,7 +19,7 @@ _MASKS_AT_ONCE = 20
 
 
 def prepare_model(model_id: str, source: Path, output: Path) -> tuple[str, str | None]:
-    """Copy a model unless it is there, and keep its shape among the targets.
+    """Copy a model unless that is done, and cache its shape, a training target.
 
     Args:
         model_id: ``catid/id``.
@@ -46,7 +46,7 @@ def prepare_model(model_id: str, source: Path, output: Path) -> tuple[str, str |
 
 
 def write_masks(entry: Entry, cameras: Cameras, output: Path) -> None:
-    """Make the amodal masks that a data set will ask for.
+    """Make the amodal masks that training will need, and cache them.
 
     Args:
         entry: annotation of the scan.
@@ -60,10 +60,9 @@ def write_masks(entry: Entry, cameras: Cameras, output: Path) -> None:
     cache = MaskCache(folder=output / "cache")
     for start in range(0, len(cameras.intrinsics), _MASKS_AT_ONCE):
         frames = slice(start, start + _MASKS_AT_ONCE)
-        some = Cameras(
-            cameras.intrinsics[frames].float(), cameras.world_from_camera[frames].float(), cameras.image_size
-        )
-        foreground_masks(objects, some, shapenet_root=output / "shapenet", cache=cache)
+        intrinsics, pose = cameras.intrinsics[frames].float(), cameras.world_from_camera[frames].float()
+        chunk = Cameras(intrinsics, pose, cameras.image_size)
+        foreground_masks(objects, chunk, shapenet_root=output / "shapenet", cache=cache)
 
 
 def check_disk(error: BaseException, output: Path) -> None:
