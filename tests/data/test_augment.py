@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from raytran.data.augment import Augmentation, change_colors, color_change, mirror_scene, turn_scene
+from raytran.data.augment import Augmentation, change_colors, color_change, mirror_scene, rotate_scene
 from raytran.data.dataset import scan2cad_dataset
 from raytran.data.shapenet.models import read_mesh
 from raytran.data.shapenet.voxelize import voxelize_solid
@@ -110,7 +110,7 @@ def assert_proper(scene: SceneBatch) -> None:
 
 @pytest.mark.parametrize("angle", [0.7, -2.5])
 def test_turned_models_project_to_the_same_pixels(scene, angle) -> None:
-    turned = turn_scene(scene, angle)
+    turned = rotate_scene(scene, angle)
     assert_proper(turned)
     for before, after in zip(placed(scene.objects[0]), placed(turned.objects[0]), strict=True):
         assert np.abs(before - after).max() > 0.3
@@ -124,7 +124,9 @@ def test_turned_models_project_to_the_same_pixels(scene, angle) -> None:
 
 
 def test_the_yaw_of_objects_grows_counter_clockwise(scene) -> None:
-    before, after = (yaw_from_rotation(part.objects[0].rotation) for part in (scene, turn_scene(scene, 0.3)))
+    before, after = (
+        yaw_from_rotation(part.objects[0].rotation) for part in (scene, rotate_scene(scene, 0.3))
+    )
     torch.testing.assert_close(after - before, torch.full((3,), 0.3))
 
 
@@ -172,7 +174,7 @@ def test_occupancy_of_a_mirrored_and_of_a_quarter_turned_scene(scene) -> None:
     occupancy = scene.occupancy[0]
     for changed, expected in (
         (mirror_scene(scene), occupancy.flip(0)),
-        (turn_scene(scene, math.pi / 2), occupancy.rot90(1, (0, 1))),
+        (rotate_scene(scene, math.pi / 2), occupancy.rot90(1, (0, 1))),
     ):
         found = occupancy_of(changed)
         assert (found & expected).sum() / (found | expected).sum() > 0.99

@@ -14,7 +14,7 @@ import trimesh
 from raytran.data.augment import Augmentation
 from raytran.data.cache import MaskCache
 from raytran.data.dataset import scan2cad_dataset
-from raytran.data.targets import STANDS_OFF, foreground_masks, seen_objects, visible_masks
+from raytran.data.targets import MAX_SURFACE_OFFSET, foreground_masks, seen_objects, visible_masks
 from raytran.errors import ConfigError, DataError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.rotation import rotation_from_yaw
@@ -187,7 +187,7 @@ def test_visible_masks_against_rays_cast_by_hand(seed, write_cube, tmp_path):
     found = visible_masks(objects, cameras, scan_mesh=mesh, **sources)
     for mask, pose in zip(found, cameras.world_from_camera, strict=True):
         of_object, of_scan = (slab_depths(boxes, *rays(pose)).min(axis=0) for boxes in (objects, others))
-        expected = np.isfinite(of_object) & (of_scan >= of_object - STANDS_OFF)
+        expected = np.isfinite(of_object) & (of_scan >= of_object - MAX_SURFACE_OFFSET)
         assert (mask.numpy().ravel() != expected).sum() <= 2, "but for rays along an edge"
     amodal = foreground_masks(objects, cameras, **sources)
     assert (found & ~amodal).sum() == 0

@@ -112,7 +112,7 @@ class TestOccupancy:
     def test_inner_cells_are_passed_over(self) -> None:
         """A solid of 63³ cells is known by its hull and a few points inside."""
         shape = np.ones((SHAPE_SIZE,) * 3, dtype=bool)
-        chosen = targets._enough_cells(shape, np.full(3, 0.05))
+        chosen = targets._sufficient_cells(shape, np.full(3, 0.05))
         assert 63**3 - 61**3 < chosen.sum() < 0.12 * chosen.size
 
     def test_a_flat_object_and_a_single_solid_cell(self) -> None:

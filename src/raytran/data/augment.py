@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random changes of training scenes under which cameras, images, objects and masks stay true to each other.
+"""Random changes of training scenes that keep cameras, images, objects and masks consistent.
 
-A scene is changed as a whole: its world is turned or mirrored, its voxel volume shifted, its colours changed.
-The voxel grid changes with it, so a changed scene has no occupancy; it is made from the changed objects.
+A scene is changed as a whole: its world is rotated or mirrored, its voxel volume shifted, its colours
+changed. A changed scene has no occupancy: that must be made anew from the changed objects and grid.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ class Augmentation:
     """How strongly training scenes are changed; all zero leaves them as they are.
 
     Attributes:
-        yaw_deg: the world turns about its up axis by up to this angle, either way; 180 for any direction.
+        yaw_deg: the world rotates about its up axis by up to this angle, either way; 180 for any direction.
         shift: the voxel volume moves by up to this along x, y, z, either way, metres.
         mirror: probability that the scene is mirrored.
         brightness: colours are multiplied by 1 - b … 1 + b.
         contrast: distances from mid-grey are multiplied by 1 - c … 1 + c.
         saturation: distances from each pixel's own grey are multiplied by 1 - s … 1 + s.
-        hue_deg: colours turn about the grey axis of the RGB cube by up to this angle, either way.
-        frame_dropout: probability that a chosen frame is left out; frames that stay come again in its
-            place, so that the number of images is the same.
+        hue_deg: colours rotate about the grey axis of the RGB cube by up to this angle, either way.
+        frame_dropout: probability that a chosen frame is left out; others are repeated in its place, so that
+            the number of images stays the same.
 
     Raises:
         ConfigError: a value is out of range.
@@ -80,30 +80,32 @@ class Augmentation:
             N positions, in the order of ``chosen``.
         """
         draw = torch.rand(len(chosen), generator=generator)
-        stay = draw >= self.frame_dropout
-        stay[draw.argsort(descending=True)[:min_views]] = True
-        if stay.all():
+        stays = draw >= self.frame_dropout
+        stays[draw.argsort(descending=True)[:min_views]] = True
+        if stays.all():
             return list(chosen)
-        kept = [position for position, stays in zip(chosen, stay.tolist(), strict=True) if stays]
-        return [kept[i] for i in choose_random(len(kept), len(chosen), generator).tolist()]
+        remaining = [chosen[i] for i in stays.nonzero().flatten().tolist()]
+        return [remaining[i] for i in choose_random(len(remaining), len(chosen), generator).tolist()]
 
     def __call__(self, scene: SceneBatch, generator: torch.Generator) -> SceneBatch:
         """Return the scene changed at random.
 
-        What one setting does to a scene depends on the generator alone, not on the other settings.
+        The random numbers of one setting do not depend on the other settings.
 
         Args:
             scene: of any B; all of its scenes are changed alike. Images are uint8.
             generator: source of the randomness.
         """
+        # All numbers are drawn always, so that switching one setting off leaves the others as they were.
         flip, yaw, *rest = torch.rand(9, generator=generator, dtype=torch.float64).tolist()
-        shift, (brightness, contrast, saturation, hue) = rest[:3], (2 * part - 1 for part in rest[3:])
+        shift = rest[:3]
+        brightness, contrast, saturation, hue = (2 * number - 1 for number in rest[3:])
         if flip < self.mirror:
             scene = mirror_scene(scene)
         if self.yaw_deg:
-            scene = turn_scene(scene, math.radians(self.yaw_deg) * (2 * yaw - 1))
+            scene = rotate_scene(scene, math.radians(self.yaw_deg) * (2 * yaw - 1))
         if any(self.shift):
-            offset = [size * (2 * part - 1) for size, part in zip(self.shift, shift, strict=True)]
+            offset = [size * (2 * number - 1) for size, number in zip(self.shift, shift, strict=True)]
             scene = replace(
                 scene, grid_center=scene.grid_center + scene.grid_center.new_tensor(offset), occupancy=None
             )
@@ -119,24 +121,24 @@ class Augmentation:
         return scene
 
 
-def turn_scene(scene: SceneBatch, angle: float) -> SceneBatch:
-    """Turn the world about its up axis, counter-clockwise seen from above; images stay as they are.
+def rotate_scene(scene: SceneBatch, angle: float) -> SceneBatch:
+    """Rotate the world about its up axis, counter-clockwise seen from above; images stay as they are.
 
     Args:
         scene: of any B.
         angle: radians.
     """
     cos, sin = math.cos(angle), math.sin(angle)
-    turn = torch.tensor([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+    rotation = torch.tensor([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
     pose = scene.views.world_from_camera
     return _changed(
         scene,
-        views=replace(scene.views, world_from_camera=_times(_square(turn, 4), pose)),
-        grid_center=_times(turn, scene.grid_center[..., None])[..., 0],
+        views=replace(scene.views, world_from_camera=_product(_in_identity(rotation, 4), pose)),
+        grid_center=_product(rotation, scene.grid_center[..., None])[..., 0],
         change=lambda objects: replace(
             objects,
-            center=_times(turn, objects.center[..., None])[..., 0],
-            rotation=_times(turn, objects.rotation),
+            center=_product(rotation, objects.center[..., None])[..., 0],
+            rotation=_product(rotation, objects.rotation),
         ),
         foreground=scene.foreground,
     )
@@ -146,7 +148,7 @@ def mirror_scene(scene: SceneBatch) -> SceneBatch:
     """Mirror the world at its plane x = 0, and with it every image, camera, box and shape.
 
     With M = diag(-1, 1, 1) a camera's pose becomes M · pose · M and an object's rotation M · R · M, which are
-    turns again: cameras and objects are mirrored along their own x axis, images from left to right, so
+    rotations again: cameras and objects are mirrored along their own x axis, images from left to right, so
     c_x → W - c_x. An object's size and symmetry stay. It is no longer its CAD model, so it has no model name.
 
     Args:
@@ -156,11 +158,12 @@ def mirror_scene(scene: SceneBatch) -> SceneBatch:
     intrinsics = views.intrinsics.clone()
     intrinsics[..., 0, 1] *= -1
     intrinsics[..., 0, 2] = width - intrinsics[..., 0, 2]
-    pose = _times(_square(_MIRROR, 4), views.world_from_camera, _square(_MIRROR, 4))
+    mirror = _in_identity(_MIRROR, 4)
+    pose = _product(mirror, views.world_from_camera, mirror)
     return _changed(
         scene,
         views=Views(views.images.flip(-1), intrinsics, pose),
-        grid_center=_times(_MIRROR, scene.grid_center[..., None])[..., 0],
+        grid_center=_product(_MIRROR, scene.grid_center[..., None])[..., 0],
         change=_mirrored,
         foreground=None if scene.foreground is None else scene.foreground.flip(-1),
     )
@@ -177,17 +180,17 @@ def color_change(
         brightness: factor of the colour.
         contrast: factor of the distance from mid-grey.
         saturation: factor of the distance from the pixel's grey value (BT.601).
-        hue: turn about the axis red = green = blue, radians.
+        hue: rotation about the axis red = green = blue, radians.
 
     Returns:
         ``(3, 3)`` matrix and ``(3,)`` offset.
     """
     # Rodrigues' formula about (1, 1, 1)/√3.
     axis = torch.tensor([[0.0, -1.0, 1.0], [1.0, 0.0, -1.0], [-1.0, 1.0, 0.0]]) / math.sqrt(3)
-    turn = torch.eye(3) * math.cos(hue) + math.sin(hue) * axis + (1 - math.cos(hue)) / 3
+    rotation = torch.eye(3) * math.cos(hue) + math.sin(hue) * axis + (1 - math.cos(hue)) / 3
     saturate = saturation * torch.eye(3) + (1 - saturation) * _LUMA.expand(3, 3)
     offset = torch.full((3,), brightness * (1 - contrast) * _MID_GREY)
-    return brightness * contrast * saturate @ turn, offset
+    return brightness * contrast * saturate @ rotation, offset
 
 
 def change_colors(images: Tensor, matrix: Tensor, offset: Tensor) -> Tensor:
@@ -203,7 +206,7 @@ def change_colors(images: Tensor, matrix: Tensor, offset: Tensor) -> Tensor:
     """
     changed = torch.empty(images.shape, dtype=torch.uint8)
     changed[..., 3:, :, :] = images[..., 3:, :, :]
-    # Half a grey level more, so that cutting off the fraction rounds; image by image, to stay in the cache.
+    # Half a level is added because the cast to uint8 cuts the fraction off. One image at a time stays cached.
     offset = (offset + 0.5)[:, None]
     color = torch.empty(3, math.prod(images.shape[-2:]))
     for old, new in zip(images.flatten(0, -4), changed.flatten(0, -4), strict=True):
@@ -234,23 +237,23 @@ def _changed(
 def _mirrored(objects: ObjectSet) -> ObjectSet:
     return replace(
         objects,
-        center=_times(_MIRROR, objects.center[..., None])[..., 0],
-        rotation=_times(_MIRROR, objects.rotation, _MIRROR),
+        center=_product(_MIRROR, objects.center[..., None])[..., 0],
+        rotation=_product(_MIRROR, objects.rotation, _MIRROR),
         shape=None if objects.shape is None else objects.shape.flip(1),
         model_id=(),
     )
 
 
-def _times(first: Tensor, *others: Tensor) -> Tensor:
-    """Return the product of matrices, computed in float64, in the type of the second."""
+def _product(first: Tensor, *others: Tensor) -> Tensor:
+    """Return the product of matrices, computed in float64, in the dtype of the second one."""
     product = first
     for other in others:
         product = product @ other.double()
     return product.to(others[0].dtype)
 
 
-def _square(turn: Tensor, size: int) -> Tensor:
-    """Return ``turn`` as the upper left of the identity of ``size``."""
-    matrix = torch.eye(size, dtype=turn.dtype)
-    matrix[: len(turn), : len(turn)] = turn
+def _in_identity(block: Tensor, size: int) -> Tensor:
+    """Return the identity matrix of ``size`` with ``block`` as its upper left corner."""
+    matrix = torch.eye(size, dtype=block.dtype)
+    matrix[: len(block), : len(block)] = block
     return matrix

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Boolean arrays kept on disk under a key that names all their inputs, so that an entry never goes stale."""
+"""A cache of boolean arrays on disk; an entry's key is a digest of all its inputs, so it is never stale."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class MaskCache:
     """A folder of boolean arrays, safe for any number of readers and writers at once.
 
     Entries are packed bits, compressed by zlib, whose checksum is tested on reading. A damaged entry counts
-    as missing. Writers replace whole files, so a reader meets the old one or the new one.
+    as missing. Writers replace whole files, so a reader sees the old one or the new one.
 
     Args:
         folder: where the entries lie; made on the first write.
@@ -46,8 +46,8 @@ class MaskCache:
     ) -> tuple[NDArray[np.bool_], list[int]]:
         """Return several arrays of one shape, ``(N, *shape)``, and the positions of those that are missing.
 
-        Those are all False in the stack. One call is faster than N of ``read``: all bits are unpacked at
-        once, straight into the stack.
+        Missing arrays are all False in the stack. One call is faster than N of ``read``: all bits are
+        unpacked at once, straight into the stack.
         """
         count = math.prod(shape)
         packed = np.zeros((len(keys), -(-count // 8)), dtype=np.uint8)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Several scenes to one batch."""
+"""Joins several scenes to one batch."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def collate_scenes(samples: Sequence[SceneBatch]) -> SceneBatch:
     if len(shapes) > 1:
         raise ShapeError(f"expected scenes with images of one number and size, got {sorted(shapes)}")
     if len(samples) == 1:
-        # Spares a copy of all images.
+        # This saves a copy of all images.
         return samples[0]
     objects = [sample.objects for sample in samples]
     new_views = [sample.new_views for sample in samples]
@@ -50,6 +50,7 @@ def _join_views(parts: Sequence[Views]) -> Views:
     )
 
 
-def _join(parts: Sequence[Tensor | None]) -> Tensor | None:
-    present = [part for part in parts if part is not None]
-    return torch.cat(present) if len(present) == len(parts) else None
+def _join(tensors: Sequence[Tensor | None]) -> Tensor | None:
+    """Return the tensors joined along B, or None if a scene has none."""
+    present = [tensor for tensor in tensors if tensor is not None]
+    return torch.cat(present) if len(present) == len(tensors) else None

@@ -238,7 +238,7 @@ class SceneDataset(Dataset[SceneBatch]):
         wanted = self._object_choice == "seen" and self._targets & {"objects", "shapes"}
         if not wanted or self._shapenet_root is None or scene.objects is None:
             return None
-        views = _select_views(scene.views, seen)
+        views = scene.views.select(torch.tensor(seen))
         cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], self._image_size)
         (objects,), root = scene.objects, self._shapenet_root
         return seen_objects(objects, cameras, shapenet_root=root, cache=self._cache).any(dim=0)
@@ -374,16 +374,11 @@ def _hold_out_views(scene: SceneBatch, seen: Sequence[int], rendered: Sequence[i
     """Return the scene with the views at positions ``seen``, and those at ``rendered`` as new views."""
     return replace(
         scene,
-        views=_select_views(scene.views, seen),
-        new_views=_select_views(scene.views, rendered),
+        views=scene.views.select(torch.tensor(seen)),
+        new_views=scene.views.select(torch.tensor(rendered)),
         frame_id=tuple(tuple(names[position] for position in seen) for names in scene.frame_id),
         foreground=None if scene.foreground is None else scene.foreground[:, list(seen)],
     )
-
-
-def _select_views(views: Views, positions: Sequence[int]) -> Views:
-    chosen = list(positions)
-    return Views(views.images[:, chosen], views.intrinsics[:, chosen], views.world_from_camera[:, chosen])
 
 
 def _objects_in(annotations: Mapping[str, SceneAnnotation] | None, scene_id: str) -> ObjectSet:

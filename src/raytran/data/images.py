@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading and resizing the images of a scan, some of which may be damaged."""
+"""Reads and resizes the images of a scan, some of which may be damaged."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def read_frames(
     where: Path,
     min_views: int = MIN_VIEWS,
 ) -> tuple[Tensor, list[int]]:
-    """Do as ``read_images`` does with frames that need not be files.
+    """Read the chosen frames as ``read_images`` does; frames need not be files.
 
     Args:
         read: returns ``(3, H, W)`` uint8 of the frame at a position, or raises DataError if it is damaged.
@@ -152,9 +152,12 @@ def read_frames(
     good = [position for position in chosen if reader.can_read(position)]
     for position in [position for position in chosen if position in reader.failed]:
         near_to_far = np.argsort(np.abs(np.arange(num_frames) - position), kind="stable").tolist()
-        fresh = (other for other in near_to_far if other not in good and reader.can_read(other))
-        again = (other for other in near_to_far if other in good)
-        good.extend(other for other in [next(fresh, next(again, -1))] if other >= 0)
+        # The nearest frame that is not used yet, or if there is none the nearest that is used comes again.
+        unused = (other for other in near_to_far if other not in good and reader.can_read(other))
+        used_again = (other for other in near_to_far if other in good)
+        replacement = next(unused, next(used_again, None))
+        if replacement is not None:
+            good.append(replacement)
     if reader.failed:
         first = next(iter(reader.failed.values()))
         _warn_once(f"skipped {len(reader.failed)} unreadable images of {where}: {first}")
@@ -168,7 +171,7 @@ def read_frames(
 
 
 class _Reader:
-    """Reads each image of a scan at most once, into one tensor, and remembers those that cannot be read."""
+    """Reads each image of a scan at most once, into one tensor, and records those that cannot be read."""
 
     def __init__(self, read: Callable[[int], Tensor], count: int) -> None:
         self.failed: dict[int, DataError] = {}
@@ -187,7 +190,7 @@ class _Reader:
             if not self._row:
                 self._images = torch.empty(self._count, *image.shape, dtype=image.dtype)
             self._row[position] = len(self._row)
-            # At once, so that the memory of one image serves them all: fresh memory costs more than the copy.
+            # Copied at once, so that all images reuse the memory of one: new memory costs more than the copy.
             self._images[self._row[position]] = image
         return position in self._row
 

@@ -27,7 +27,7 @@ _log = logging.getLogger(__name__)
 LOST = "pose is not finite or no rigid motion"
 NO_IMAGE = "no image"
 NO_POSE = "no pose"
-"""Reasons for which a frame is dropped."""
+"""Reasons why a frame is dropped."""
 
 
 @dataclass(frozen=True, kw_only=True)

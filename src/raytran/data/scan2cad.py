@@ -28,9 +28,9 @@ _SYMMETRY = {
 }
 
 SMALLEST_SCALE = 1e-3
-"""Models with a smaller scale along any axis are mistakes of annotation (ODAM skips the same)."""
+"""Models with a smaller scale along any axis are annotation errors (ODAM skips the same)."""
 
-_THINNEST = 1e-3
+_MIN_SIZE = 1e-3
 """Least size of a box, metres: a CAD model may be a flat sheet, and sizes are compared by their logarithm."""
 
 
@@ -63,7 +63,7 @@ def annotation_path(root: Path) -> Path:
 
 
 def annotation_digest(root: Path) -> str | None:
-    """Return a digest of a data set's annotation, which tells it from others; None if it has none."""
+    """Return a digest of a data set's annotation, which identifies the data set; None if it has none."""
     path = annotation_path(root)
     return file_digest(path) if path.is_file() else None
 
@@ -117,7 +117,7 @@ def parse_entry(entry: Any) -> SceneAnnotation:
     """Return one entry of an annotation file, checked.
 
     Raises:
-        DataError: it lacks a field or holds something impossible; says what, not where.
+        DataError: it lacks a field or holds something impossible; the message does not name the entry.
     """
     try:
         return _scene(entry)
@@ -149,7 +149,7 @@ def scene_objects(annotation: SceneAnnotation) -> ObjectSet:
     return ObjectSet(
         label=torch.tensor([CLASSES.index(name) for name in classes], dtype=torch.int64),
         center=center[..., 0].float(),
-        size=(2 * annotation.box_half_size * scale).clamp(min=_THINNEST).float(),
+        size=(2 * annotation.box_half_size * scale).clamp(min=_MIN_SIZE).float(),
         rotation=(pose[:, :3, :3] / scale[:, None]).float(),
         symmetry=annotation.symmetry,
         score=torch.ones(len(pose)),
@@ -160,18 +160,18 @@ def scene_objects(annotation: SceneAnnotation) -> ObjectSet:
 def scene_alignments(annotation: SceneAnnotation) -> CadAlignments:
     """Return all of a scene's models as annotated: what the published evaluation scripts compare with.
 
-    ``scale`` are the lengths of the columns of inv(M_scan) · T R S, and ``quaternion`` is the turn closest to
-    the columns at length one. A model without volume has no quaternion: NaN.
+    ``scale`` are the lengths of the columns of inv(M_scan) · T R S, and ``quaternion`` is the rotation
+    closest to the columns at length one. A model without volume has no quaternion: NaN.
 
     Args:
         annotation: one scene of ``read_annotations``.
     """
     pose = annotation.scan_from_cad
     scale = pose[:, :3, :3].norm(dim=1)
-    parts = [name.split("/", 1) for name in annotation.model_id]
+    names = [name.split("/", 1) for name in annotation.model_id]
     return CadAlignments(
-        catid=tuple(catid for catid, _ in parts),
-        id_cad=tuple(name for _, name in parts),
+        catid=tuple(catid for catid, _ in names),
+        id_cad=tuple(id_cad for _, id_cad in names),
         translation=pose[:, :3, 3],
         quaternion=quaternion_from_matrix(pose[:, :3, :3] / scale[:, None]),
         scale=scale,
@@ -205,14 +205,14 @@ def _symmetry(name: str) -> int:
 
 
 def _matrices(trs: Sequence[dict[str, Sequence[float]]]) -> Tensor:
-    """Return T · R · S of each, ``(M, 4, 4)`` float64; quaternions are [w, x, y, z]."""
+    """Return T · R · S of each entry, ``(M, 4, 4)`` float64; quaternions are [w, x, y, z]."""
     matrices = torch.eye(4, dtype=torch.float64).repeat(len(trs), 1, 1)
-    quaternion = _vectors([part["rotation"] for part in trs], 4)
+    quaternion = _vectors([entry["rotation"] for entry in trs], 4)
     if (quaternion == 0).all(dim=1).any():
         raise ValueError("a quaternion has length zero")
     rotation = matrix_from_quaternion(quaternion)
-    matrices[:, :3, :3] = rotation * _vectors([part["scale"] for part in trs], 3)[:, None]
-    matrices[:, :3, 3] = _vectors([part["translation"] for part in trs], 3)
+    matrices[:, :3, :3] = rotation * _vectors([entry["scale"] for entry in trs], 3)[:, None]
+    matrices[:, :3, 3] = _vectors([entry["translation"] for entry in trs], 3)
     return matrices
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which scenes a data set has, and what it keeps of them in memory: objects of all, cameras of the latest."""
+"""Which scenes a data set has, and what of them stays in memory: objects of all, cameras of the latest."""
 
 from __future__ import annotations
 
@@ -70,21 +70,22 @@ def read_split(scannet: Path, split: str) -> list[str] | None:
 class ObjectTable:
     """The objects of many scenes in six tensors.
 
-    A tensor costs a file handle in each worker process that is not forked, so thousands of small ones would
-    not reach it.
+    A tensor costs a file handle in each worker process that is not forked, so thousands of small tensors
+    could not be sent to one.
 
     Args:
         scenes: objects without shapes.
     """
 
     def __init__(self, scenes: Sequence[ObjectSet]) -> None:
-        parts = [ObjectSet.empty(), *scenes]
+        # The empty set in front gives the tensors their types if there is no scene, and the first end, 0.
+        sets = [ObjectSet.empty(), *scenes]
         names = ("label", "center", "size", "rotation", "symmetry", "score")
         self._all = ObjectSet(
-            **{name: torch.cat([getattr(part, name) for part in parts]) for name in names},
-            model_id=tuple(model_id for part in parts for model_id in part.model_id),
+            **{name: torch.cat([getattr(objects, name) for objects in sets]) for name in names},
+            model_id=tuple(model_id for objects in sets for model_id in objects.model_id),
         )
-        self._ends = tuple(torch.tensor([len(part) for part in parts]).cumsum(0).tolist())
+        self._ends = tuple(torch.tensor([len(objects) for objects in sets]).cumsum(0).tolist())
 
     def __len__(self) -> int:
         return len(self._ends) - 1
@@ -95,13 +96,13 @@ class ObjectTable:
 
 
 class RecentScans:
-    """Scans by name; those asked for last stay in memory, packed into about 0.2 kB a frame.
+    """Scans by name; the most recently used stay in memory, packed into about 0.2 kB a frame.
 
     A copy for another process starts empty.
 
     Args:
         scans_root: folder of the scans.
-        max_bytes: most memory of all scans kept.
+        max_bytes: most memory of all scans together.
     """
 
     def __init__(self, scans_root: Path, max_bytes: int) -> None:

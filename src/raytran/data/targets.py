@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a scene's annotation says the network should output: shapes, occupancy and amodal masks."""
+"""Training targets made from a scene's annotation: shapes, occupancy, masks and which objects are seen."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ from raytran.structs import SHAPE_SIZE, ObjectSet
 _MAX_POINTS = 1 << 25
 """Most points that may fill one object's box; with more it is far larger than any room."""
 
-STANDS_OFF = 0.2
-"""Depth by which the scan's surface may be nearer than a CAD model that stands for it, metres: as far as a
-model may be off in Scan2CAD's benchmark."""
+MAX_SURFACE_OFFSET = 0.2
+"""Depth by which the scan's surface may be nearer than the CAD model aligned to it, metres: the error that
+Scan2CAD's benchmark allows."""
 
 _VERSION = 1
 """Part of every key; raise it when the way a target is computed changes."""
@@ -51,7 +51,9 @@ def shape_grids(model_ids: tuple[str, ...], *, shapenet_root: Path, cache: MaskC
     keys = [digest(_VERSION, SHAPE_SIZE, content) for content in contents]
     grids, missing = cache.read_stack("shape", keys, (SHAPE_SIZE,) * 3)
     for i in missing:
-        if (first := keys.index(keys[i])) < i:
+        # The same model may come several times: its shape is made once.
+        first = keys.index(keys[i])
+        if first < i:
             grids[i] = grids[first]
         else:
             grids[i] = voxelize_solid(*_unit_mesh(shapenet_root, model_ids[i], contents[i]), size=SHAPE_SIZE)
@@ -63,7 +65,7 @@ def scene_occupancy(objects: ObjectSet, grid: VoxelGrid) -> Tensor:
     """Return the voxels that hold part of an object.
 
     Each solid cell of an object's shape is filled with points at most half a voxel apart; a voxel is
-    occupied if a point lies in it. So voxels may be smaller than cells.
+    occupied if a point lies in it. Voxels may therefore be smaller than the cells of a shape.
 
     Args:
         objects: M objects with shapes.
@@ -116,7 +118,7 @@ def foreground_masks(
         return rasterize_mask(object_meshes(objects, shapenet_root=shapenet_root), missing).numpy()
 
     key = _scene_key(objects, shapenet_root)
-    return _of_each_camera("foreground", key, cameras, cameras.image_size, cache, draw)
+    return _cached_per_camera("foreground", key, cameras, cameras.image_size, cache, draw)
 
 
 def visible_masks(
@@ -124,9 +126,9 @@ def visible_masks(
 ) -> Tensor:
     """Return the pixels on which an object is seen: the amodal mask without what the scan's surface hides.
 
-    Objects hide only pixels of each other, which stay in the mask of all of them. What else is in the room is
-    known from the scan's own mesh, which holds the real surfaces of the objects too: a pixel is hidden where
-    that is nearer than the CAD model by more than ``STANDS_OFF``.
+    Where objects hide each other the pixel stays, because the mask is of all objects together. What else
+    hides them is known from the scan's own mesh, which has the real surfaces of the objects too: a pixel is
+    hidden where the mesh is nearer than the CAD model by more than ``MAX_SURFACE_OFFSET``.
 
     Args:
         objects: M objects with model names.
@@ -152,17 +154,17 @@ def visible_masks(
     def draw(missing: Cameras) -> NDArray[np.bool_]:
         meshes = object_meshes(objects, shapenet_root=shapenet_root)
         scan = _scan_surface(scan_mesh, content)
-        return rasterize_visible(meshes, [scan], missing, tolerance=STANDS_OFF).numpy()
+        return rasterize_visible(meshes, [scan], missing, tolerance=MAX_SURFACE_OFFSET).numpy()
 
-    key = digest(STANDS_OFF, content, _scene_key(objects, shapenet_root))
-    return _of_each_camera("visible", key, cameras, cameras.image_size, cache, draw)
+    key = digest(MAX_SURFACE_OFFSET, content, _scene_key(objects, shapenet_root))
+    return _cached_per_camera("visible", key, cameras, cameras.image_size, cache, draw)
 
 
 def seen_objects(objects: ObjectSet, cameras: Cameras, *, shapenet_root: Path, cache: MaskCache) -> Tensor:
-    """Return which objects each view sees: those that are the nearest object in one of its pixels at least.
+    """Return which objects each view sees: those that are the nearest object in at least one of its pixels.
 
-    Objects hide each other, by the surfaces of their CAD models at the centres of the pixels; nothing else
-    does, neither walls nor furniture that is not annotated.
+    Objects hide each other, by the surfaces of their CAD models at the centres of the pixels. Nothing else
+    hides them here, neither walls nor furniture that is not annotated.
 
     Args:
         objects: M objects with model names.
@@ -180,12 +182,12 @@ def seen_objects(objects: ObjectSet, cameras: Cameras, *, shapenet_root: Path, c
     def draw(missing: Cameras) -> NDArray[np.bool_]:
         ids, _ = rasterize_ids(object_meshes(objects, shapenet_root=shapenet_root), missing)
         seen = np.zeros((len(ids), len(objects)), dtype=bool)
-        for of_view, nearest in zip(seen, ids.numpy(), strict=True):
-            of_view[np.unique(nearest[nearest >= 0])] = True
+        for is_seen, nearest in zip(seen, ids.numpy(), strict=True):
+            is_seen[np.unique(nearest[nearest >= 0])] = True
         return seen
 
     key = _scene_key(objects, shapenet_root)
-    return _of_each_camera("seen", key, cameras, (len(objects),), cache, draw)
+    return _cached_per_camera("seen", key, cameras, (len(objects),), cache, draw)
 
 
 def _scene_key(objects: ObjectSet, shapenet_root: Path) -> str:
@@ -194,7 +196,7 @@ def _scene_key(objects: ObjectSet, shapenet_root: Path) -> str:
     return digest(_VERSION, contents, *(t.numpy() for t in (objects.center, objects.size, objects.rotation)))
 
 
-def _of_each_camera(
+def _cached_per_camera(
     kind: str,
     scene_key: str,
     cameras: Cameras,
@@ -202,7 +204,7 @@ def _of_each_camera(
     cache: MaskCache,
     draw: Callable[[Cameras], NDArray[np.bool_]],
 ) -> Tensor:
-    """Return an array of each of N cameras from the cache, ``(N, *shape)``; draw those that it lacks."""
+    """Return an array for each of N cameras, ``(N, *shape)``; ``draw`` makes those that the cache lacks."""
     intrinsics, world_from_camera = cameras.intrinsics.numpy(), cameras.world_from_camera.numpy()
     keys = [
         digest(scene_key, cameras.image_size, *camera)
@@ -240,7 +242,7 @@ def object_meshes(objects: ObjectSet, *, shapenet_root: Path) -> list[tuple[NDAr
         DataError: a CAD file is missing or cannot be read.
     """
     return [
-        _place(_unit_mesh(shapenet_root, model_id, _content(shapenet_root, model_id)), objects, m)
+        _posed(_unit_mesh(shapenet_root, model_id, _content(shapenet_root, model_id)), objects, m)
         for m, model_id in enumerate(objects.model_id)
     ]
 
@@ -252,7 +254,7 @@ def _content(shapenet_root: Path, model_id: str) -> str:
 
 @lru_cache(maxsize=64)
 def _unit_mesh(shapenet_root: Path, model_id: str, _content: str) -> tuple[NDArray, NDArray]:
-    """Return vertices and faces of a CAD model, its box turned into the cube [-½, ½]³.
+    """Return vertices and faces of a CAD model, its box stretched to the cube [-½, ½]³.
 
     The box is that of the vertices which faces use, as in Scan2CAD's annotation.
     """
@@ -264,7 +266,8 @@ def _unit_mesh(shapenet_root: Path, model_id: str, _content: str) -> tuple[NDArr
     return (vertices - (low + high) / 2) / extent, faces.reshape(-1, 3)
 
 
-def _place(unit_mesh: tuple[NDArray, NDArray], objects: ObjectSet, m: int) -> tuple[NDArray, NDArray]:
+def _posed(unit_mesh: tuple[NDArray, NDArray], objects: ObjectSet, m: int) -> tuple[NDArray, NDArray]:
+    """Return the mesh with its unit cube stretched and moved to the box of object ``m``."""
     vertices, faces = unit_mesh
     size, rotation, center = _box_of(objects, m)
     return (vertices * size) @ rotation.T + center, faces
@@ -292,35 +295,37 @@ def _voxels_of(
         origin: voxel coordinates of the corner of cell (0, 0, 0).
         resolution: of the grid.
     """
-    parts = np.maximum(np.ceil(2 * cell), 1).astype(np.int64)
-    if parts.max() > 1:
-        for axis, count in enumerate(parts.tolist()):
+    # Cells larger than half a voxel are split along each axis; of very small ones a part is enough.
+    splits = np.maximum(np.ceil(2 * cell), 1).astype(np.int64)
+    if splits.max() > 1:
+        for axis, count in enumerate(splits.tolist()):
             shape = shape.repeat(count, axis=axis)
     elif (cell <= 0.25).all():
-        shape = _enough_cells(shape, cell)
+        shape = _sufficient_cells(shape, cell)
     row, k = np.divmod(np.flatnonzero(shape), shape.shape[2])
-    along = [(np.arange(n) + 0.5) / count for n, count in zip(shape.shape, parts, strict=True)]
+    along = [(np.arange(n) + 0.5) / count for n, count in zip(shape.shape, splits, strict=True)]
     number = np.zeros(len(k))
     inside = np.ones(len(k), dtype=bool)
+    # Axis by axis of the grid: the sums over x and y are made once a row of cells, not once a cell.
     for (x, y, z), start, count in zip(voxel_from_cell, origin, resolution, strict=True):
-        place = np.add.outer(along[0] * x + start, along[1] * y).ravel()[row] + (along[2] * z)[k]
-        inside &= (place >= 0) & (place < count)
+        position = np.add.outer(along[0] * x + start, along[1] * y).ravel()[row] + (along[2] * z)[k]
+        inside &= (position >= 0) & (position < count)
         number *= count
-        number += np.floor(place, out=place)
+        number += np.floor(position, out=position)
     return number[inside].astype(np.int64)
 
 
-def _enough_cells(shape: NDArray[np.bool_], cell: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return solid cells that meet the same voxels as all of them, if cells are small (``_voxels_of``).
+def _sufficient_cells(shape: NDArray[np.bool_], cell: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return some of the solid cells that meet the same voxels as all of them do, if cells are small.
 
-    They are the cells with a neighbour that is not solid, and of the inner ones those on a lattice of half a
-    voxel. A voxel that meets an inner cell, but none with such a neighbour, holds solid cells alone (it is
-    convex and several cells wide), hence a point of the lattice, which no ball as wide as a voxel misses.
+    These are the outer cells, which have a neighbour that is not solid, and of the inner cells those on a
+    lattice of half a voxel. A voxel that meets an inner but no outer cell is filled with solid cells, as it
+    is convex and several cells wide. So it contains a point of the lattice, as every ball of its width does.
     """
     core = shape
     for axis in range(3):
         low, middle, high = (
-            core[(slice(None),) * axis + (part,)] for part in (slice(None, -2), slice(1, -1), slice(2, None))
+            core[(slice(None),) * axis + (cut,)] for cut in (slice(None, -2), slice(1, -1), slice(2, None))
         )
         core = low & middle & high
     chosen = shape.copy()

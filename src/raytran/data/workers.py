@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same work on many things, by processes that end with the one that started them."""
+"""Does the same work on many items in worker processes, which end with the process that started them."""
 
 from __future__ import annotations
 
@@ -35,10 +35,11 @@ def work_on(
 ) -> Iterator[Result]:
     """Yield ``function(item)`` of each item, in the order in which they are finished.
 
-    No more is handed out than is worked on, so an interrupt or an error waits for the items in work only.
+    An item is handed out only when a process is free for it, so an interrupt or an error waits for the items
+    in work and no others.
 
     Args:
-        items: what to work on; sent to the processes one by one.
+        items: what to work on; each is sent to a process by itself.
         function: a function of a module, or a ``functools.partial`` of one.
         label: name of the progress bar.
         processes: 0 for one per core; 1 works in this process.
@@ -52,24 +53,26 @@ def work_on(
     columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, disable=not progress or not items) as bar:
         task = bar.add_task(label, total=len(items))
-        for result in _in_turn(items, function) if workers <= 1 else _at_once(items, function, workers):
+        for result in (
+            _sequentially(items, function) if workers <= 1 else _in_parallel(items, function, workers)
+        ):
             bar.advance(task)
             yield result
 
 
-def _in_turn(items: Sequence[Item], function: Callable[[Item], Result]) -> Iterator[Result]:
+def _sequentially(items: Sequence[Item], function: Callable[[Item], Result]) -> Iterator[Result]:
     for item in items:
         yield function(item)
 
 
-def _at_once(items: Sequence[Item], function: Callable[[Item], Result], workers: int) -> Iterator[Result]:
+def _in_parallel(items: Sequence[Item], function: Callable[[Item], Result], workers: int) -> Iterator[Result]:
     context = multiprocessing.get_context("spawn")
     with (
         _one_thread_each(),
         ProcessPoolExecutor(workers, mp_context=context, initializer=_become_worker) as pool,
     ):
         try:
-            yield from _handed_out(items, function, workers, pool)
+            yield from _as_completed(items, function, workers, pool)
         except BrokenProcessPool as error:
             raise DataError(
                 "a worker process was ended from outside, perhaps because memory ran out: "
@@ -77,7 +80,7 @@ def _at_once(items: Sequence[Item], function: Callable[[Item], Result], workers:
             ) from error
 
 
-def _handed_out(
+def _as_completed(
     items: Sequence[Item], function: Callable[[Item], Result], workers: int, pool: ProcessPoolExecutor
 ) -> Iterator[Result]:
     waiting = iter(items)
@@ -90,7 +93,7 @@ def _handed_out(
 
 
 def _become_worker() -> None:
-    """Leave interrupts to the parent, and end with it even if it is killed."""
+    """Leave interrupts to the parent process, and end with it even if it is killed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
@@ -104,7 +107,7 @@ def _end_with_parent() -> None:
 
 @contextlib.contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Let processes started inside use one thread each."""
+    """Make processes that are started inside the block use one thread each."""
     before = {name: os.environ.get(name) for name in _ONE_THREAD}
     os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
     try:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""rooms-v1: rooms to learn from, to choose by and to be judged on, the same for everybody.
+"""rooms-v1: a fixed benchmark of generated rooms for training, validation and test.
 
 Rooms of validation and test share no CAD model, texture or layout with training or with each other. Another
-test set takes its furniture from given CAD models. Nothing but the number of rooms can be chosen.
+test set takes its furniture from given CAD models. Only the number of rooms can be chosen.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from raytran.rooms.library import MODELS_PER_CLASS
 from raytran.rooms.scene import RoomSettings
 
 FORMAT = "raytran.rooms-v1/1"
-"""Rises when the rooms are no longer the same; results before and after cannot be compared."""
+"""Rises when the rooms change; results before and after cannot be compared."""
 
 NUM_TRAIN, NUM_VAL, NUM_TEST = 1000, 100, 100
-"""Rooms of the benchmark; fewer are for quick tries."""
+"""Rooms of the benchmark; fewer are for quick trials."""
 
 SETTINGS = RoomSettings(
     seed=0,
@@ -35,7 +35,7 @@ SETTINGS = RoomSettings(
 TEST_FRAMES = 96
 """Frames of a test room, as many as the paper predicts from."""
 
-# Far apart, so that a room does not depend on how many others there are.
+# The ranges are fixed, so that a room does not depend on how many others there are.
 _NUMBERS = {"train": range(8000), "val": range(8000, 9000), "test": range(9000, 9500)}
 _FURNITURE_NUMBERS = range(9500, 10000)
 
@@ -56,8 +56,8 @@ def generate_rooms_v1(
     Args:
         output: folder that gets ``scannet/``, ``shapenet/``, ``scan2cad/`` and ``rooms.json``.
         num_train: training scans, numbered from 0: those of ``generate_rooms`` with these settings.
-        num_val: scans to choose models by, numbered from 8000.
-        num_test: scans to be judged on, of ``TEST_FRAMES`` frames, numbered from 9000.
+        num_val: scans to choose networks by, numbered from 8000.
+        num_test: scans to report results on, of ``TEST_FRAMES`` frames, numbered from 9000.
         processes: worker processes, 0 for one per core; 1 works in this process.
         progress: show a progress bar.
 
@@ -86,7 +86,7 @@ def generate_rooms_v1_furniture(
     processes: int = 0,
     progress: bool = True,
 ) -> RoomsReport:
-    """Make test rooms with furniture that no generator drew: a shift in shape.
+    """Make test rooms with furniture that was not generated: shapes from another distribution.
 
     They differ from the test rooms of ``generate_rooms_v1`` in their CAD models and, as larger or smaller
     pieces fit elsewhere, their layouts.
@@ -112,9 +112,9 @@ def generate_rooms_v1_furniture(
     )
 
 
-def _models(place: int) -> range:
-    """Return the numbers of generated models of the split at a place; training is at 0."""
-    return range(place * MODELS_PER_CLASS, (place + 1) * MODELS_PER_CLASS)
+def _models(split: int) -> range:
+    """Return the numbers of the generated models of a split: 0 is training, 1 validation, 2 test."""
+    return range(split * MODELS_PER_CLASS, (split + 1) * MODELS_PER_CLASS)
 
 
 def _listed(output: Path, split: str) -> int:

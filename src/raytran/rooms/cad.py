@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CAD models drawn at random: a class name and a random generator give a piece of furniture."""
+"""Generates CAD models: a class and a random generator give a piece of furniture."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ RECIPES: dict[str, tuple[tuple[float, Recipe], ...]] = {
         (0.05, others.copier),
     ),
 }
-"""Per class, what can be drawn and how often."""
+"""The generators of each class, each with its probability."""
 
 OTHER_IDS: dict[str, str] = {
     "bed": "02818832",
@@ -102,12 +102,13 @@ class CadModel:
         catid: ShapeNet's synset.
         model_id: 32 hexadecimal digits that name the geometry and colours.
         category: one of ``raytran.structs.CLASSES``.
-        kind: what a person would call it, e.g. ``office chair``.
+        kind: kind of furniture, e.g. ``office chair``.
         vertices: ``(V, 3)`` float64.
         faces: ``(F, 3)`` int64, wound outwards; several closed parts that may overlap.
         face_color: ``(F, 3)`` RGB in [0, 1].
         face_group: ``(F,)`` int64 material index, one per colour.
-        symmetry: equal turns about +Y: 1, 2, 4, or 0 for a body of revolution. Turns are about the origin.
+        symmetry: number of equal rotations about the +Y axis through the origin that map the model onto
+            itself: 1, 2, 4, or 0 for a body of revolution.
         size_m: ``(3,)`` real size along the object's axes, metres; one factor scales ``vertices`` to it.
         support: where it stands: ``floor``, ``wall`` (on the floor, its back +Z to a wall), ``table`` (on a
             table, desk or low cabinet) or ``bed`` (on a bed or sofa).
@@ -171,8 +172,8 @@ def finish_model(category: str, design: Design) -> CadModel:
 
 def _join(design: Design) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Concatenate all parts into one mesh, in metres."""
-    pieces = [colored.part for colored in design.parts]
-    starts = np.cumsum([0, *(len(piece.vertices) for piece in pieces[:-1])])
-    vertices = np.concatenate([piece.vertices for piece in pieces])
-    faces = np.concatenate([piece.faces + start for piece, start in zip(pieces, starts, strict=True)])
+    parts = [colored.part for colored in design.parts]
+    starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    vertices = np.concatenate([part.vertices for part in parts])
+    faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=True)])
     return vertices, faces.astype(np.int64)

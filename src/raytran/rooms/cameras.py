@@ -34,15 +34,16 @@ _CELL = 0.1
 _HEADINGS = 48
 _PITCHES = 10
 _SEEN_SHARE = 0.003
-_LEAST_SHARE = 0.0012
+_MIN_SHARE = 0.0012
+"""Share of a picture that an object must cover to count as seen in it."""
 
 
 @dataclass(frozen=True)
 class _Survey:
-    """What can be seen from where.
+    """Which objects are seen from which positions in which directions.
 
     Attributes:
-        position: ``(p, 2)`` places on the floor plan, metres.
+        position: ``(p, 2)`` points of the floor plan, metres.
         share: ``(p, headings, M)`` of the picture that each object covers.
     """
 
@@ -154,7 +155,7 @@ def _choose_stations(
         ``(count, 2)`` indices into the survey.
     """
     quality = np.minimum(survey.share / (5 * _SEEN_SHARE), 1.0)
-    # A view much nearer than a step to an earlier one adds little: prefer new places.
+    # A camera within a step of an earlier one adds little: prefer new positions.
     novelty = np.ones(quality.shape[:2])
     times = np.zeros(len(weight))
     chosen = []
@@ -236,5 +237,5 @@ def _missed(cameras: list[Pinhole], renderer: Renderer, count: int) -> NDArray[n
     for camera in cameras:
         owner = renderer.owners(camera, max(1, camera.image_size[0] // 48))
         share = np.bincount(owner[owner >= 0], minlength=count) / len(owner)
-        times += share >= _LEAST_SHARE
+        times += share >= _MIN_SHARE
     return times < min(MIN_VIEWS, len(cameras))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The embedded default data: rooms that are made when training or evaluation first asks for them."""
+"""The default data: rooms that are generated when training or evaluation first asks for them."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from raytran.data.files import SettingsRecord
 from raytran.rooms.benchmark import generate_rooms_v1
 from raytran.rooms.generate import generate_rooms
 
@@ -31,11 +32,13 @@ def ensure_rooms(output: Path, **settings: Any) -> None:
     """
     output = Path(output)
     if rooms_are_complete(output):
-        found = json.loads((output / "rooms.json").read_text(encoding="utf-8"))
+        recorded = SettingsRecord(output / "rooms.json").read()
         asked = json.loads(json.dumps(settings))
-        other = [f"{name}={found[name]}" for name in asked if name in found and found[name] != asked[name]]
-        if other:
-            _log.warning("using the rooms in %s as they are, made with %s", output, " ".join(other))
+        different = [
+            f"{name}={recorded[name]}" for name in asked if name in recorded and recorded[name] != asked[name]
+        ]
+        if different:
+            _log.warning("using the rooms in %s as they are, made with %s", output, " ".join(different))
         return
     count = settings["num_train"] + settings["num_val"]
     _log.info("making %d rooms in %s (first use; an interrupted set is completed)", count, output.resolve())
@@ -62,8 +65,8 @@ def ensure_rooms_v1(
     output = Path(output)
     asked = (num_train, num_val, num_test)
     if rooms_are_complete(output, LISTS_V1):
-        there = [len(_scans(output, name)) for name in LISTS_V1]
-        if all(found >= count for found, count in zip(there, asked, strict=True)):
+        present = [len(_scans(output, name)) for name in LISTS_V1]
+        if all(number >= count for number, count in zip(present, asked, strict=True)):
             return
     count = sum(asked)
     _log.info("making %d rooms in %s (first use; an interrupted set is completed)", count, output.resolve())

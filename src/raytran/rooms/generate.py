@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Furnished rooms by the number, in the raw layout of ScanNet, ShapeNet and Scan2CAD."""
+"""Generates data sets of furnished rooms in the raw layout of ScanNet, ShapeNet and Scan2CAD."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ _NOTICES = ("credits.csv", "LICENCES.txt")
 
 @dataclass(frozen=True)
 class RoomSplit:
-    """What the rooms of one split are made of.
+    """How the rooms of one split are made.
 
     Attributes:
         name: ``train``, ``val`` or ``test``.
         numbers: of its scans; a room follows from the seed and its number.
         frames: pictures with a valid pose in each scan.
-        models: numbers of the generated models of each class that its rooms draw from.
-        textures: which draw of the textures its rooms are painted with.
-        given: whose of given CAD models its rooms draw from, ``train`` or ``val``; None for all.
+        models: numbers of the generated models of each class that its rooms use.
+        textures: number of the set of textures that its rooms are painted with.
+        given: split of the given CAD models that its rooms use, ``train`` or ``val``; None for all.
     """
 
     name: str
@@ -72,10 +72,10 @@ class RoomsReport:
     """What a call of ``generate_rooms`` did.
 
     Attributes:
-        root: the data set.
+        root: folder of the data set.
         train: scans for training.
         val: held-out scans.
-        made: scans made by this call; the others were there already.
+        made: number of scans made by this call; the others existed already.
         objects: objects in all scans together.
         seconds: wall-clock time.
         cads_left_out: ``catid/id`` of given CAD models that cannot be used, with the reason.
@@ -128,9 +128,9 @@ def generate_rooms(
         min_objects: least number of objects in a room.
         max_objects: greatest number of objects in a room.
         room_size: ranges of the two sides of the floor, metres.
-        cads: folder in ShapeNet's layout to furnish with; None for generated models. Training and held-out
-            rooms get different models. What it lacks, such as a class, is generated; ``cads.json`` tells
-            which models are used, which are not and why.
+        cads: folder in ShapeNet's layout with the furniture; None for generated models. Training and held-out
+            rooms get different models. Classes that it lacks are generated. ``cads.json`` says which models
+            are used, which are not and why.
         processes: worker processes, 0 for one per core; 1 works in this process.
         progress: show a progress bar.
 
@@ -164,11 +164,11 @@ def make_splits(
     Args:
         output: as of ``generate_rooms``.
         settings: of all rooms, except that each split has its own number of frames.
-        splits: whose numbers do not meet.
-        claim: what ``rooms.json`` says of the data set; one of another claim is left alone.
-        cads: as of ``generate_rooms``, and so are ``processes`` and ``progress``.
-        processes: see there.
-        progress: see there.
+        splits: the splits; no two of them have a number in common.
+        claim: content of ``rooms.json``; a data set with another one is not touched.
+        cads: see ``generate_rooms``.
+        processes: see ``generate_rooms``.
+        progress: see ``generate_rooms``.
 
     Raises:
         DataError: as ``generate_rooms``.
@@ -176,7 +176,7 @@ def make_splits(
     started = time.monotonic()
     output, cads = Path(output).resolve(), None if cads is None else Path(cads).resolve()
     _claim(output, claim if cads is None else claim | {"cads": digest_of(list_models(cads))})
-    left_out = {} if cads is None else _look_through(output, cads, processes, progress)
+    left_out = {} if cads is None else _survey_cads(output, cads, processes, progress)
     scans = output / "scannet" / "scans"
     scans.mkdir(parents=True, exist_ok=True)
     sweep(scans, f"{UNFINISHED}*")
@@ -209,7 +209,7 @@ def _make_scan(output: Path, settings: RoomSettings, cads: Path | None, which: t
     return write_scene(scene, scan_id=scan_name(number), root=output, rng=rng)
 
 
-def _look_through(output: Path, cads: Path, processes: int, progress: bool) -> dict[str, str]:
+def _survey_cads(output: Path, cads: Path, processes: int, progress: bool) -> dict[str, str]:
     """Write ``cads.json`` unless it is there; return which models cannot be used, and why."""
     path = output / _CADS
     if not path.is_file():
@@ -243,7 +243,11 @@ def _check(settings: RoomSettings, num_train: int, num_val: int) -> None:
 
 
 def _claim(output: Path, asked: dict[str, Any]) -> None:
-    """Write ``rooms.json``, or see that the one there asked for the same."""
+    """Write ``rooms.json``.
+
+    Raises:
+        DataError: there is one with other settings.
+    """
     record = SettingsRecord(output / "rooms.json")
     different = record.begin(asked)
     if different:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Standing furniture in a room so that nothing interpenetrates: at walls, at tables, on top of others."""
+"""Places furniture in a room so that nothing interpenetrates: at walls, at tables, on top of others."""
 
 from __future__ import annotations
 
@@ -47,14 +47,14 @@ class Layout:
         Returns:
             the object's number, or None if it does not fit there.
         """
-        turn = _draw_tilt(self.rng) if tilt else np.eye(3)
-        rotation = turn @ upright_rotation(yaw)
+        tilting = _draw_tilt(self.rng) if tilt else np.eye(3)
+        rotation = tilting @ upright_rotation(yaw)
         scale = self._draw_scale(model)
         center, half = cad_box(model)
         drop = np.abs(rotation[2]) @ (scale * half)
         middle = np.array([xy[0], xy[1], drop + 0.001])
         translation = middle - rotation @ (scale * center)
-        return self._add(PlacedObject(model, scale, rotation, translation, turn))
+        return self._add(PlacedObject(model, scale, rotation, translation, tilting))
 
     def at_wall(self, model: CadModel, *, near: float | None = None, wall: int | None = None) -> int | None:
         """Stand a model with its back to a wall, at wall coordinate ``near`` or anywhere along it."""
@@ -93,7 +93,7 @@ class Layout:
             model: what to place.
             direction: ``(2,)`` unit vector from the anchor to where the model shall stand.
             along: shift to the left of ``direction``, metres.
-            facing: ``"anchor"`` turns the front to the anchor, ``"same"`` as the anchor's front.
+            facing: ``"anchor"``: the front looks at the anchor; ``"same"``: where the anchor's front looks.
         """
         other = self.objects[anchor]
         half = np.abs(direction @ (other.rotation[:2] * other.box.half[0])[:, [0, 2]]).sum()
@@ -117,11 +117,11 @@ class Layout:
             parent: number of the object below.
             model: what to place.
             place: position in units of the parent's half width (to its right) and half depth (to its back);
-                None tries random places.
-            turn: yaw against the parent's, radians.
+                None tries random positions.
+            turn: yaw relative to the parent's, radians.
         """
         base = self.objects[parent]
-        height_at = _surface(base)
+        height_at = _height_of(base)
         half = base.box.half[0]
         for _ in range(1 if place else 8):
             share = np.array(place if place else self.rng.uniform(-0.8, 0.8, size=2))
@@ -153,13 +153,14 @@ class Layout:
         return np.asarray(model.size_m, dtype=np.float64)
 
     def _draw_scale(self, model: CadModel) -> NDArray[np.float64]:
-        """Real size of the CAD model, stretched a little along each axis as far as its symmetry allows."""
+        """Draw a scale ``(3,)``: the model's real size, stretched a little as far as its symmetry allows."""
         stretch = self.rng.uniform(0.95, 1.05, size=3)
         if model.symmetry in (0, 4):
             stretch[2] = stretch[0]
         return np.linalg.norm(model.size_m) * stretch
 
     def _add(self, candidate: PlacedObject) -> int | None:
+        """Add an object if it is inside the room and overlaps nothing; return its number, else None."""
         box = candidate.box
         corners = box.corners()[0]
         room = np.array(self.room.size)
@@ -175,14 +176,14 @@ class Layout:
 
 
 def _draw_tilt(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw a small turn about a horizontal axis (Rodrigues' formula)."""
+    """Draw a small rotation about a horizontal axis (Rodrigues' formula)."""
     angle, heading = MAX_TILT * rng.beta(1.3, 2.2), rng.uniform(0, 2 * np.pi)
     x, y = np.cos(heading), np.sin(heading)
     cross = np.array([[0.0, 0.0, y], [0.0, 0.0, -x], [-y, x, 0.0]])
     return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
 
 
-def _surface(base: PlacedObject) -> Callable[[NDArray[np.float64], NDArray[np.float64]], float | None]:
+def _height_of(base: PlacedObject) -> Callable[[NDArray[np.float64], NDArray[np.float64]], float | None]:
     """Return a function that finds where something with a given footprint can stand on ``base``.
 
     It takes the middle ``(2,)`` and the half extents ``(2,)`` of the footprint in the base's frame turned

@@ -25,21 +25,22 @@ from raytran.rooms.symmetry import measure_symmetry
 from raytran.structs import CLASS_BY_CATID, CLASSES
 
 MODELS_PER_CATEGORY = 150
-"""Models of one synset that are looked at; of more, these are chosen by their names' hashes."""
+"""Models of one synset that are examined; of more, these are chosen by the hashes of their names."""
 
 MOST_FACES = 100_000
-"""Models with more triangles are left out: a few of them in a room slow every step down."""
+"""Models with more triangles are left out: a few of them in a room make every step slow."""
 
 MODELS_PER_CLASS = 100
 """Generated models of one class that the rooms of one split share, as scans share those of Scan2CAD."""
 
 FEW = 5
-"""Where a library has fewer models of what is wanted, generated ones make up this number."""
+"""Where a library has fewer models of a kind, generated ones are added up to this number."""
 
 SPLITS = ("train", "val")
 
 _HELD_OUT_SHARE = 0.2
-_THINNEST = 0.003
+_MIN_EXTENT = 0.003
+"""Models of which a side of the box is shorter than this share of its diagonal are left out as flat."""
 
 
 @dataclass(frozen=True)
@@ -51,8 +52,8 @@ class LibraryModel:
         model_id: ShapeNet's name of the model.
         category: one of ``raytran.structs.CLASSES``.
         kind: name in ``KINDS``.
-        symmetry: as in ``CadModel``, as the model's ``.json`` says or as measured.
-        size_m: real size along the object's axes, metres; drawn if the ``.json`` does not tell.
+        symmetry: as in ``CadModel``; from the model's ``.json``, or measured.
+        size_m: real size along the object's axes, metres; from the model's ``.json``, or drawn.
         split: ``train`` or ``val``, of the rooms that may hold it.
     """
 
@@ -72,8 +73,8 @@ class CadLibrary:
     Attributes:
         root: the folder in ShapeNet's layout.
         models: those that can be used, by synset and name.
-        left_out: ``catid/id`` of the others that were looked at, with the reason.
-        digest: names all models in the folder, used or not.
+        left_out: ``catid/id`` of the others that were examined, with the reason.
+        digest: of the names of all models in the folder, used or not.
     """
 
     root: Path
@@ -96,13 +97,13 @@ def list_models(root: Path) -> list[tuple[str, str]]:
     Raises:
         DataError: there is none.
     """
-    found = [(catid, name) for catid in sorted(KNOWN_CATIDS) for name in model_names(root, catid)]
-    if not found:
+    names = [(catid, name) for catid in sorted(KNOWN_CATIDS) for name in model_names(root, catid)]
+    if not names:
         raise DataError(
             f"no CAD model of furniture lies in {root}; give a folder of ShapeNetCore, or one made by "
             "prepare dataset=cads"
         )
-    return found
+    return names
 
 
 def digest_of(names: list[tuple[str, str]]) -> str:
@@ -111,7 +112,7 @@ def digest_of(names: list[tuple[str, str]]) -> str:
 
 
 def survey(root: Path, *, processes: int = 0, progress: bool = True) -> CadLibrary:
-    """Look through the models of a folder: which can be used, how large and how symmetric they are.
+    """Examine the models of a folder: which can be used, how large and how symmetric they are.
 
     Args:
         root: folder in ShapeNet's layout.
@@ -126,8 +127,9 @@ def survey(root: Path, *, processes: int = 0, progress: bool = True) -> CadLibra
     results = dict(
         work_on(chosen, partial(_examine, root), label="CADs", processes=processes, progress=progress)
     )
-    models = tuple(found for name in sorted(chosen) if isinstance(found := results[name], LibraryModel))
-    left_out = {"/".join(name): why for name in sorted(chosen) if isinstance(why := results[name], str)}
+    ordered = {name: results[name] for name in sorted(chosen)}
+    models = tuple(result for result in ordered.values() if isinstance(result, LibraryModel))
+    left_out = {"/".join(name): result for name, result in ordered.items() if isinstance(result, str)}
     if not models:
         name, why = next(iter(left_out.items()))
         raise DataError(f"none of the {len(left_out)} CAD models in {root} can be used; {name}: {why}")
@@ -190,14 +192,14 @@ def _model(root: Path, catid: str, model_id: str) -> LibraryModel:
         raise DataError(f"{path} has {count:,} triangles, more than {MOST_FACES:,}; simplify it to use it")
     if abs(np.linalg.norm(extent) - 1) > 0.01:
         raise DataError(f"{path} is not normalised: the diagonal of its box is not 1; scale it")
-    if extent.min() < _THINNEST:
+    if extent.min() < _MIN_EXTENT:
         raise DataError(f"{path} is flat; a box needs three sides")
     facts = _facts(path)
     rng = np.random.default_rng(_hash_of((catid, model_id)))
     kind = facts.get("kind")
     if kind not in KINDS or KINDS[kind].catid != catid:
         kind = guess_kind(catid, extent.tolist())
-    size = _told_size(facts)
+    size = _size_of(facts)
     drawn = draw_size(catid, extent, rng) if size is None else size
     held_out = rng.random() < _HELD_OUT_SHARE
     symmetry = facts.get("symmetry")
@@ -225,8 +227,8 @@ def _facts(path: Path) -> dict[str, Any]:
     return facts if isinstance(facts, dict) else {}
 
 
-def _told_size(facts: dict[str, Any]) -> np.ndarray | None:
-    """Return the real size that a ``.json`` in metres tells, None for ShapeNet's, which are in any unit."""
+def _size_of(facts: dict[str, Any]) -> np.ndarray | None:
+    """Return the real size in a ``.json`` in metres; None for ShapeNet's, whose unit is not known."""
     if facts.get("unit") != "m":
         return None
     try:
@@ -258,7 +260,7 @@ def _load(root: Path, model: LibraryModel) -> CadModel:
 
 @dataclass(frozen=True)
 class ModelPool:
-    """The CAD models that all rooms of one seed and split draw from.
+    """The CAD models that the rooms of one seed and split draw from.
 
     Attributes:
         seed: seed of the rooms.
@@ -275,7 +277,10 @@ class ModelPool:
     def draw(
         self, category: str, rng: np.random.Generator, *, kinds: Collection[str] = ()
     ) -> CadModel | None:
-        """Draw a model of a class, if ``kinds`` is not empty of one of these kinds; None if none is found."""
+        """Draw a model of a class, of one of ``kinds`` unless these are empty; None if there is none.
+
+        Generated models are drawn where no library is given, or where it has fewer than ``FEW`` that fit.
+        """
         if self.library is not None:
             given = [
                 model

@@ -92,15 +92,15 @@ class Surfaces:
         )
 
     @staticmethod
-    def joined(parts: Sequence[Surfaces]) -> Surfaces:
-        """Return the triangles of all ``parts``, in order."""
+    def joined(sets: Sequence[Surfaces]) -> Surfaces:
+        """Return the triangles of several sets as one set, in order."""
         return Surfaces(
-            triangles=np.concatenate([part.triangles for part in parts]),
-            dark=np.concatenate([part.dark for part in parts]),
-            light=np.concatenate([part.light for part in parts]),
-            texture=np.concatenate([part.texture for part in parts]),
-            emissive=np.concatenate([part.emissive for part in parts]),
-            owner=np.concatenate([part.owner for part in parts]),
+            triangles=np.concatenate([surfaces.triangles for surfaces in sets]),
+            dark=np.concatenate([surfaces.dark for surfaces in sets]),
+            light=np.concatenate([surfaces.light for surfaces in sets]),
+            texture=np.concatenate([surfaces.texture for surfaces in sets]),
+            emissive=np.concatenate([surfaces.emissive for surfaces in sets]),
+            owner=np.concatenate([surfaces.owner for surfaces in sets]),
         )
 
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Objects that stand in a room, their boxes, and which boxes overlap.
 
-The test for overlap is not ``raytran.geometry.boxes``'s, which computes the volume that boxes share: that takes
+``raytran.geometry.boxes`` is not used for the overlap: it computes the volume that boxes share, which takes
 ten times as long for the thousands of positions that are tried in a room.
 """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What generated rooms are like, told beside them: ``report.json``, ``report.txt``, ``rooms.jpg``."""
+"""Describes generated rooms in files beside them: ``report.json``, ``report.txt``, ``rooms.jpg``."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def rooms_text(statistics: Mapping[str, Mapping[str, Any]]) -> str:
     lines = [" " * 35 + "".join(f"{name:>18}" for name in statistics)]
     for what, cells in _rows(list(statistics.values())):
         lines.append(f"{what:<35}" + "".join(f"{cell:>18}" for cell in cells))
-    by_class = {name: part["by_class"] for name, part in statistics.items()}
+    by_class = {name: of_split["by_class"] for name, of_split in statistics.items()}
     counts = {split: {name: of[name]["objects"] for name in CLASSES} for split, of in by_class.items()}
     sizes = [
         f"         {name:<11}" + "".join(f"{_size(of[name]['size_m']):>22}" for of in by_class.values())
@@ -87,16 +87,17 @@ def _pictures(root: Path, annotation: SceneAnnotation) -> tuple[Image.Image, Ima
     return frame, draw_objects(frame, camera, objects, meshes)
 
 
-def _rows(parts: list[Mapping[str, Any]]) -> Iterator[tuple[str, list[str]]]:
-    sights = [part["sight"] for part in parts]
-    per_room = [part["objects_per_room"] for part in parts]
-    yield "rooms", [str(part["rooms"]) for part in parts]
-    yield "frames a room", [", ".join(map(str, part["frames_per_room"])) for part in parts]
-    yield "objects", [str(part["objects"]) for part in parts]
-    yield "CAD models", [str(part["cad_models"]) for part in parts]
+def _rows(splits: list[Mapping[str, Any]]) -> Iterator[tuple[str, list[str]]]:
+    """Yield the rows of the table: what a row is of, and its text for each split."""
+    sights = [split["sight"] for split in splits]
+    per_room = [split["objects_per_room"] for split in splits]
+    yield "rooms", [str(split["rooms"]) for split in splits]
+    yield "frames a room", [", ".join(map(str, split["frames_per_room"])) for split in splits]
+    yield "objects", [str(split["objects"]) for split in splits]
+    yield "CAD models", [str(split["cad_models"]) for split in splits]
     yield "objects a room, mean (range)", [f"{q['mean']} ({q['min']:g} to {q['max']:g})" for q in per_room]
     yield "  of half of the rooms", [f"{q['quarter']:g} to {q['three_quarters']:g}" for q in per_room]
-    yield "rooms of at most 10 objects", [str(part["rooms_with_at_most"]["10"]) for part in parts]
+    yield "rooms of at most 10 objects", [str(split["rooms_with_at_most"]["10"]) for split in splits]
     yield "rooms whose frames were looked at", [str(sight["rooms"]) for sight in sights]
     frames = [sight["frames_per_object"] for sight in sights]
     yield "frames that show an object, median", [f"{q['median']:g}" for q in frames]

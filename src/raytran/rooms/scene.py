@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A whole scene before it is written: furnished room, camera walk, and how both lie in the scan's frame."""
+"""Makes a whole scene before it is written: a furnished room, a camera walk, and their pose in the scan."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Scene:
         objects: its objects, parents before what stands on them.
         cameras: the walk, in the room's frame.
         renderer: draws the room.
-        scan_from_room: ``(4, 4)``: rooms do not lie along the axes of their scan.
+        scan_from_room: ``(4, 4)`` pose of the room in its scan, whose axes are not those of the room.
     """
 
     room: Room
@@ -79,10 +79,10 @@ def make_scene(
     """
     pool = pool or ModelPool(settings.seed)
     for _ in range(_ATTEMPTS):
-        layout = _furnished(settings, pool, rng)
+        layout = _furnish(settings, pool, rng)
         if len(layout.objects) < settings.min_objects:
             continue
-        scene = _filmed(settings, layout, rng, textures)
+        scene = _record(settings, layout, rng, textures)
         if scene is not None:
             return scene
     (a, b), (c, d) = settings.room_size
@@ -92,7 +92,7 @@ def make_scene(
     )
 
 
-def _furnished(settings: RoomSettings, pool: ModelPool, rng: np.random.Generator) -> Layout:
+def _furnish(settings: RoomSettings, pool: ModelPool, rng: np.random.Generator) -> Layout:
     kind = str(rng.choice(list(ROOM_KINDS), p=list(ROOM_KINDS.values())))
     x, y = (rng.uniform(low, high) for low, high in settings.room_size)
     if kind == "bathroom":
@@ -106,8 +106,8 @@ def _furnished(settings: RoomSettings, pool: ModelPool, rng: np.random.Generator
     return layout
 
 
-def _filmed(settings: RoomSettings, layout: Layout, rng: np.random.Generator, textures: int) -> Scene | None:
-    """Walk through the room and take out what is not seen often enough; None if too little remains."""
+def _record(settings: RoomSettings, layout: Layout, rng: np.random.Generator, textures: int) -> Scene | None:
+    """Walk a camera through the room and remove objects it sees too rarely; None if too few remain."""
     paints = [_paint_object(placed, rng) for placed in layout.objects]
     renderer = _make_renderer(layout.room, layout.objects, paints, textures)
     cameras, missed = plan_path(
@@ -120,13 +120,14 @@ def _filmed(settings: RoomSettings, layout: Layout, rng: np.random.Generator, te
         rng=rng,
     )
     if missed.any():
-        kept = _without(layout.objects, missed)
-        if len(kept) < settings.min_objects:
+        remaining = _without(layout.objects, missed)
+        if len(remaining) < settings.min_objects:
             return None
         objects = tuple(
-            replace(layout.objects[i], parent=_new_number(kept, layout.objects[i].parent)) for i in kept
+            replace(layout.objects[i], parent=_new_number(remaining, layout.objects[i].parent))
+            for i in remaining
         )
-        renderer = _make_renderer(layout.room, objects, [paints[i] for i in kept], textures)
+        renderer = _make_renderer(layout.room, objects, [paints[i] for i in remaining], textures)
     else:
         objects = tuple(layout.objects)
     renderer.expose(cameras[:: max(1, len(cameras) // 6)], brightness=rng.uniform(0.35, 0.55))
@@ -134,20 +135,21 @@ def _filmed(settings: RoomSettings, layout: Layout, rng: np.random.Generator, te
 
 
 def _without(objects: list[PlacedObject], missed: NDArray[np.bool_]) -> list[int]:
-    """Return the numbers of the objects that stay: seen, and standing on nothing that goes."""
-    kept: list[int] = []
+    """Return the numbers of the objects that remain: not missed, and not standing on an object that was."""
+    remaining: list[int] = []
     for number, placed in enumerate(objects):
-        if not missed[number] and (placed.parent == FLOOR or placed.parent in kept):
-            kept.append(number)
-    return kept
+        if not missed[number] and (placed.parent == FLOOR or placed.parent in remaining):
+            remaining.append(number)
+    return remaining
 
 
-def _new_number(kept: list[int], parent: int) -> int:
-    return FLOOR if parent == FLOOR else kept.index(parent)
+def _new_number(remaining: list[int], parent: int) -> int:
+    """Return the number of a parent among the objects that remain."""
+    return FLOOR if parent == FLOOR else remaining.index(parent)
 
 
 def _draw_scan_frame(room: Room, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw the pose ``(4, 4)`` of the room in its scan: turned by 3 to 45 degrees and shifted."""
+    """Draw the pose ``(4, 4)`` of the room in its scan: rotated by 3 to 45 degrees and shifted."""
     yaw = np.deg2rad(rng.uniform(3.0, 45.0)) * rng.choice([-1.0, 1.0])
     sin, cos = np.sin(yaw), np.cos(yaw)
     pose = np.eye(4)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Generated CAD models written in the layout of ShapeNetCore v2."""
+"""Writes generated CAD models in the layout of ShapeNetCore v2."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BINVOX_SIZE = 128
 def write_model(model: CadModel, root: Path, *, extra: Mapping[str, object] | None = None) -> Path:
     """Write a generated model as ``root/<catid>/<id>/models/model_normalized.*`` and return that folder.
 
-    A folder that is already there is left alone: its name is drawn from the model's content. Several
+    A folder that exists is left as it is, because its name is a digest of the model's content. Several
     processes may write the same model at once.
 
     Args:

@@ -23,16 +23,16 @@ from raytran.structs import CLASSES, ObjectSet
 
 SPLITS = ("train", "val", "test")
 
-MOST_LOOKED_AT = 40
-"""Scans of a split, spread evenly, of which is counted what the cameras see."""
+MAX_EXAMINED = 40
+"""Scans of a split, spread evenly, in which the visible pixels of objects are counted."""
 
-SEEN = 0.5
-"""Least share of an object's outline in a frame that must not be hidden for the frame to show it."""
+MIN_VISIBLE_SHARE = 0.5
+"""Share of an object's outline in a frame that must not be hidden for the frame to show the object."""
 
 _ROWS = 48
 """Rows of the pictures in which pixels are counted."""
 
-_LEAST_PIXELS = 4
+_MIN_PIXELS = 4
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Sight:
     @property
     def shown(self) -> Tensor:
         """``(M, N)`` bool: a frame shows the object, not a corner of it and not mostly hidden."""
-        return (self.outline >= _LEAST_PIXELS) & (self.visible >= SEEN * self.outline)
+        return (self.outline >= _MIN_PIXELS) & (self.visible >= MIN_VISIBLE_SHARE * self.outline)
 
 
 def rooms_statistics(root: Path) -> dict[str, dict[str, Any]]:
@@ -70,13 +70,13 @@ def rooms_statistics(root: Path) -> dict[str, dict[str, Any]]:
 
 def listed_scans(root: Path) -> dict[str, list[str]]:
     """Return the scans of each split that has any."""
-    there = [name for name in SPLITS if (root / "scannet" / f"scannetv2_{name}.txt").is_file()]
-    listed = {name: read_split(root / "scannet", name) for name in there}
+    present = [name for name in SPLITS if (root / "scannet" / f"scannetv2_{name}.txt").is_file()]
+    listed = {name: read_split(root / "scannet", name) for name in present}
     return {name: scans for name, scans in listed.items() if scans}
 
 
 def look(objects: ObjectSet, cameras: Cameras, *, shapenet_root: Path) -> Sight:
-    """Count the pixels of each object in each frame; what walls hide is counted as visible.
+    """Count the pixels of each object in each frame; pixels that only a wall hides count as visible.
 
     Args:
         objects: ``M`` objects with model names.
@@ -107,15 +107,13 @@ def scan_cameras(root: Path, scan_id: str) -> Cameras:
 
 
 def _describe(root: Path, scans: Sequence[str], annotations: dict[str, SceneAnnotation]) -> dict[str, Any]:
-    found = {scan: scene_objects(annotations[scan]) for scan in scans}
-    counts = torch.tensor([len(objects) for objects in found.values()], dtype=torch.float64)
-    looked_at = [
-        scans[i] for i in dict.fromkeys(choose_even(len(scans), min(len(scans), MOST_LOOKED_AT)).tolist())
-    ]
+    objects_of = {scan: scene_objects(annotations[scan]) for scan in scans}
+    counts = torch.tensor([len(objects) for objects in objects_of.values()], dtype=torch.float64)
+    examined = [scans[i] for i in choose_even(len(scans), min(len(scans), MAX_EXAMINED)).tolist()]
     sights = [
-        look(found[scan], scan_cameras(root, scan), shapenet_root=root / "shapenet") for scan in looked_at
+        look(objects_of[scan], scan_cameras(root, scan), shapenet_root=root / "shapenet") for scan in examined
     ]
-    names = [name for objects in found.values() for name in objects.model_id]
+    names = [name for objects in objects_of.values() for name in objects.model_id]
     return {
         "rooms": len(scans),
         "objects": len(names),
@@ -123,14 +121,14 @@ def _describe(root: Path, scans: Sequence[str], annotations: dict[str, SceneAnno
         "frames_per_room": dict(sorted(Counter(sight.outline.shape[1] for sight in sights).items())),
         "objects_per_room": {"mean": round(float(counts.mean()), 2)} | _quantiles(counts),
         "rooms_with_at_most": {str(most): int((counts <= most).sum()) for most in (10, 20, 30)},
-        "by_class": _by_class(list(found.values())),
+        "by_class": _by_class(list(objects_of.values())),
         "sight": _describe_sight(sights),
     }
 
 
-def _by_class(found: Sequence[ObjectSet]) -> dict[str, dict[str, Any]]:
-    label = torch.cat([objects.label for objects in found])
-    size = torch.cat([objects.size for objects in found])
+def _by_class(scenes: Sequence[ObjectSet]) -> dict[str, dict[str, Any]]:
+    label = torch.cat([objects.label for objects in scenes])
+    size = torch.cat([objects.size for objects in scenes])
     return {
         name: {"objects": int((label == index).sum()), "size_m": _median(size[label == index])}
         for index, name in enumerate(CLASSES)
@@ -144,14 +142,17 @@ def _median(size: Tensor) -> list[float] | None:
 def _describe_sight(sights: Sequence[Sight]) -> dict[str, Any]:
     """Return what frames show of the objects.
 
-    ``rooms`` looked at, ``frames_per_object`` that show an object (quantiles over the objects),
-    ``objects_per_frame`` that a frame shows (mean), the mean ``visible_share`` of an object's outline where
-    any of it is in the picture, and ``mostly_hidden``, the share of such outlines under ``SEEN``.
+    Returns:
+        number of ``rooms`` examined; ``frames_per_object``, frames that show an object (quantiles over the
+        objects); ``objects_per_frame``, objects that a frame shows (mean); ``visible_share`` of an object's
+        outline where any of it is in the picture (mean); and ``mostly_hidden``, the share of such outlines
+        that are visible by less than ``MIN_VISIBLE_SHARE``.
     """
-    in_picture = [sight.outline >= _LEAST_PIXELS for sight in sights]
-    share = torch.cat(
-        [sight.visible[there] / sight.outline[there] for sight, there in zip(sights, in_picture, strict=True)]
-    )
+    shares = []
+    for sight in sights:
+        in_picture = sight.outline >= _MIN_PIXELS
+        shares.append(sight.visible[in_picture] / sight.outline[in_picture])
+    share = torch.cat(shares)
     frames = torch.cat([sight.shown.sum(dim=1) for sight in sights]).double()
     objects = torch.cat([sight.shown.sum(dim=0) for sight in sights]).double()
     return {
@@ -159,7 +160,7 @@ def _describe_sight(sights: Sequence[Sight]) -> dict[str, Any]:
         "frames_per_object": _quantiles(frames),
         "objects_per_frame": round(float(objects.mean()), 2),
         "visible_share": round(float(share.mean()), 3),
-        "mostly_hidden": round(float((share < SEEN).double().mean()), 3),
+        "mostly_hidden": round(float((share < MIN_VISIBLE_SHARE).double().mean()), 3),
     }
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing a scene as ScanNet, ShapeNet and Scan2CAD do: pictures, poses, CAD models and their alignment."""
+"""Writes a scene in the layouts of ScanNet, ShapeNet and Scan2CAD: images, poses, CAD models, annotation."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from raytran.rooms.scene import Scene
 from raytran.rooms.shapenet_files import write_model
 
 FRAME_STEP = 10
-"""Distance of the written frames' numbers, as in exports that keep every tenth frame of a video."""
+"""Step of the frame numbers, as in exports that keep every tenth frame of a video."""
 
 _SYMMETRY = {1: "__SYM_NONE", 2: "__SYM_ROTATE_UP_2", 4: "__SYM_ROTATE_UP_4", 0: "__SYM_ROTATE_UP_INF"}
 _JPEG_QUALITY = 90
 
 
 def write_scene(scene: Scene, *, scan_id: str, root: Path, rng: np.random.Generator) -> int:
-    """Write a scene below ``root``; the scan's folder gets its name last, when everything else is in place.
+    """Write a scene below ``root``; the scan's folder gets its name last, when everything else is written.
 
     Args:
         scene: what to write.
         scan_id: e.g. ``scene0000_00``.
         root: the data set.
-        rng: source of the lost frames and the noise of the pictures.
+        rng: source of the lost poses and the noise of the images.
 
     Returns:
         the number of objects.
@@ -61,8 +61,8 @@ def annotation_path(root: Path, scan_id: str) -> Path:
 def annotate(scene: Scene, *, scan_id: str, rng: np.random.Generator) -> dict[str, Any]:
     """Return a scene's entry of Scan2CAD's ``full_annotations.json``.
 
-    Scan2CAD's world is y-up: the scan is turned by -90 degrees about x and shifted, and CAD models are placed
-    in that world.
+    Scan2CAD's world is y-up: the scan is rotated by -90 degrees about x and shifted, and CAD models are
+    placed in that world.
     """
     world_from_scan = np.eye(4)
     world_from_scan[:3, :3] = [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
@@ -117,7 +117,7 @@ def _write_frames(scene: Scene, folder: Path, rng: np.random.Generator) -> int:
         _write_frame(folder, number, picture, scene.scan_from_room @ camera.room_from_camera)
         number += FRAME_STEP
         if index in lost_after:
-            # A fast motion, which is when tracking gets lost, blurs the picture.
+            # Tracking is lost in fast motion, which blurs the image.
             _write_frame(
                 folder, number, picture.filter(ImageFilter.BoxBlur(width / 80)), np.full((4, 4), -np.inf)
             )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which parts of an annotation can be used: the rest is left out, named and counted."""
+"""Reads the usable entries of an annotation file; the others are left out, with the reason."""
 
 from __future__ import annotations
 
@@ -25,7 +25,13 @@ _PLAIN_NAME = re.compile(r"[\w-]+")
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Part of an annotation that cannot be used; ``model`` is ``catid/id``, empty for the whole entry."""
+    """A model, or a whole entry, of an annotation that cannot be used.
+
+    Attributes:
+        scan: name of the scan.
+        model: ``catid/id``; empty for the whole entry.
+        reason: why it cannot be used.
+    """
 
     scan: str
     model: str
@@ -34,13 +40,13 @@ class LeftOut:
 
 @dataclass(frozen=True)
 class Annotations:
-    """What an annotation file holds.
+    """The content of an annotation file.
 
     Attributes:
-        entries: entry of each scan that has usable models, without the others.
+        entries: by scan, if it has usable models; models that cannot be used are removed.
         empty: scans whose entry lists no models.
         left_out: entries and models that cannot be used.
-        twice: scans with several entries; the first was taken.
+        twice: scans with several entries, of which the first is used.
     """
 
     entries: dict[str, Entry] = field(default_factory=dict)
@@ -57,11 +63,11 @@ def find_annotations(path: Path) -> Path:
     """
     if path.is_file():
         return path
-    found = [file for depth in ("", "*/", "*/*/") for file in sorted(path.glob(f"{depth}{ANNOTATIONS}"))]
-    if len(found) != 1:
-        state = "several files" if found else "no file"
+    files = [file for depth in ("", "*/", "*/*/") for file in sorted(path.glob(f"{depth}{ANNOTATIONS}"))]
+    if len(files) != 1:
+        state = "several files" if files else "no file"
         raise DataError(f"there is {state} {ANNOTATIONS} in {path}: give the path of the one to use")
-    return found[0]
+    return files[0]
 
 
 def read_usable(path: Path) -> Annotations:
@@ -70,7 +76,7 @@ def read_usable(path: Path) -> Annotations:
     Raises:
         DataError: the file is missing or no list of scenes.
     """
-    found = Annotations()
+    annotations = Annotations()
     seen: set[str] = set()
     for number, entry in enumerate(read_entries(path)):
         try:
@@ -79,25 +85,25 @@ def read_usable(path: Path) -> Annotations:
             _check_name(scene_id)
         except (DataError, TypeError, KeyError) as error:
             name = entry.get("id_scan") if isinstance(entry, dict) else None
-            found.left_out.append(LeftOut(str(name or f"entry {number}"), "", str(error)))
+            annotations.left_out.append(LeftOut(str(name or f"entry {number}"), "", str(error)))
             continue
         if scene_id in seen:
-            found.twice.append(scene_id)
+            annotations.twice.append(scene_id)
             continue
         seen.add(scene_id)
         reasons = _reasons(entry, models)
-        found.left_out.extend(
+        annotations.left_out.extend(
             LeftOut(scene_id, _name_or_nothing(model), reason)
             for model, reason in zip(models, reasons, strict=True)
             if reason
         )
         if not models:
-            found.empty.append(scene_id)
+            annotations.empty.append(scene_id)
         elif not all(reasons):
-            found.entries[scene_id] = _with_models(
+            annotations.entries[scene_id] = _with_models(
                 entry, [model for model, reason in zip(models, reasons, strict=True) if not reason]
             )
-    return found
+    return annotations
 
 
 def model_name(model: Mapping[str, Any]) -> str:
@@ -111,11 +117,11 @@ def used_models(entries: Iterable[Entry]) -> list[str]:
 
 
 def without_models(entry: Entry, broken: Mapping[str, str]) -> tuple[Entry, list[LeftOut]]:
-    """Leave the models out whose CAD file cannot be used.
+    """Return the entry of a scan without the models whose CAD file cannot be used, and these models.
 
     Args:
         entry: of a scan.
-        broken: what is wrong, by ``catid/id``.
+        broken: why a CAD file cannot be used, by ``catid/id``.
     """
     names = [(model, model_name(model)) for model in entry["aligned_models"]]
     left_out = [LeftOut(entry["id_scan"], name, broken[name]) for _, name in names if name in broken]
@@ -124,6 +130,7 @@ def without_models(entry: Entry, broken: Mapping[str, str]) -> tuple[Entry, list
 
 def _reasons(entry: Entry, models: list[Any]) -> list[str]:
     """Return why each model cannot be used, empty if it can."""
+    # One damaged model fails them all, so then each is looked at by itself.
     try:
         return _reasons_together(entry, models)
     except (DataError, TypeError, KeyError):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How large and how long a preparation will be, judged from a few real frames before it starts."""
+"""Estimates disk space and time of a preparation from a few real frames and models before it starts."""
 
 from __future__ import annotations
 
@@ -23,14 +23,15 @@ from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
 
 _SAMPLES = 3
-"""Models, scans and frames of each that are tried."""
+"""Number of models, of scans, and of frames of each of these scans that are prepared for the estimate."""
+
 _SCANS_COUNTED = 50
-"""Scans whose frames are counted."""
+"""Number of scans whose frames are counted."""
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """What is left to do.
+    """What a preparation has still to do.
 
     Attributes:
         scans: to prepare.
@@ -64,7 +65,7 @@ def estimate(
     shapenet: Path | None,
     processes: int,
 ) -> Estimate:
-    """Prepare a few frames and models without keeping them, and multiply.
+    """Prepare a few frames and models in a temporary folder, and extrapolate.
 
     Args:
         jobs: the scans that are not done.
@@ -80,10 +81,10 @@ def estimate(
         trial = Path(folder)
         model_cost = frame_cost = (0.0, 0.0)
         if shapenet is not None:
-            sample = [models[i] for i in choose_frames(len(models), _SAMPLES)]
-            model_cost = _typical(partial(_try_model, model, shapenet, trial) for model in sample)
-        chosen = [jobs[i] for i in choose_frames(len(jobs), _SAMPLES)]
-        frame_cost = _typical(partial(_try_frames, job, settings, shapenet, trial) for job in chosen)
+            some_models = [models[i] for i in choose_frames(len(models), _SAMPLES)]
+            model_cost = _median_cost(partial(_model_cost, model, shapenet, trial) for model in some_models)
+        some_jobs = [jobs[i] for i in choose_frames(len(jobs), _SAMPLES)]
+        frame_cost = _median_cost(partial(_frame_cost, job, settings, shapenet, trial) for job in some_jobs)
     workers = min(processes or os.cpu_count() or 1, max(len(jobs), 1))
     return Estimate(
         scans=len(jobs),
@@ -101,8 +102,8 @@ def _num_frames(job: ScanJob, settings: PrepareSettings) -> int:
     return 0
 
 
-def _typical(trials: Iterable[Callable[[], tuple[float, float]]]) -> tuple[float, float]:
-    """Return the medians of the bytes and seconds that trials cost; those that fail do not count."""
+def _median_cost(trials: Iterable[Callable[[], tuple[float, float]]]) -> tuple[float, float]:
+    """Return the median bytes and the median seconds of trials; trials that fail do not count."""
     costs = []
     for trial in trials:
         with suppress(DataError, OSError):
@@ -110,7 +111,7 @@ def _typical(trials: Iterable[Callable[[], tuple[float, float]]]) -> tuple[float
     return (median(b for b, _ in costs), median(s for _, s in costs)) if costs else (0.0, 0.0)
 
 
-def _try_model(model_id: str, shapenet: Path, trial: Path) -> tuple[float, float]:
+def _model_cost(model_id: str, shapenet: Path, trial: Path) -> tuple[float, float]:
     """Return bytes and seconds of a CAD model."""
     before, started = bytes_below(trial), time.perf_counter()
     _, reason = prepare_model(model_id, shapenet, trial)
@@ -119,7 +120,7 @@ def _try_model(model_id: str, shapenet: Path, trial: Path) -> tuple[float, float
     return bytes_below(trial) - before, time.perf_counter() - started
 
 
-def _try_frames(
+def _frame_cost(
     job: ScanJob, settings: PrepareSettings, shapenet: Path | None, trial: Path
 ) -> tuple[float, float]:
     """Return bytes and seconds of one frame, with its mask."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ScanNet + ShapeNet + Scan2CAD as released become a folder to train from; give it again after any kill."""
+"""Prepares ScanNet, ShapeNet and Scan2CAD as released for training; goes on where a killed call stopped."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FORMAT = "raytran.prepared/1"
 """Rises when the same files no longer give the same folder."""
 
 MARKER = "prepare.json"
-"""The file that tells a prepared folder, begun or finished, and its settings."""
+"""File with the settings that a prepared folder was begun with."""
 
 _UNFINISHED = (
     f"{UNFINISHED}*",
@@ -41,7 +41,7 @@ _UNFINISHED = (
     f"shapenet/*/*/{UNFINISHED}*",
     f"cache/*/*/{UNFINISHED}*",
 )
-"""Where processes that were killed leave temporary files."""
+"""Where processes that were killed leave temporary files and folders."""
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,8 @@ def prepare_scan2cad(
 ) -> Prepared:
     """Prepare ScanNet's scans with Scan2CAD's annotation and ShapeNet's models, or go on with it.
 
-    A scan whose folder carries its final name is done; calling again does what is missing, and other scans
-    may be asked for. The files written depend on nothing but the input and the settings.
+    A scan whose folder has its final name is done. A further call does what is missing, and may ask for other
+    scans. The files written depend on nothing but the input and the settings.
 
     Args:
         output: folder that gets ``scannet/``, ``shapenet/``, ``scan2cad/``, ``cache/`` and the report.
@@ -95,7 +95,7 @@ def prepare_scan2cad(
     try:
         with claimed(output, settings, {"annotations": None if path is None else file_digest(path)}):
             sweep(output, *_UNFINISHED)
-            preparation.say_estimate(processes)
+            preparation.log_estimate(processes)
             report = preparation.run(grid_extent)
             sweep(output, *_UNFINISHED)
     except OSError as error:
@@ -114,15 +114,15 @@ def _nothing_prepared(output: Path, report: dict[str, Any]) -> DataError:
 
 @contextmanager
 def claimed(output: Path, settings: PrepareSettings, sources: dict[str, Any]) -> Iterator[None]:
-    """Hold ``output`` for the block, begun with the same settings or new.
+    """Lock ``output`` for the block; it is new, or was begun with the same settings and input.
 
     Args:
         output: the prepared folder; made if it is missing.
-        settings: must be those it was begun with.
-        sources: what tells the input, must be the same too.
+        settings: of the preparation.
+        sources: digests of the input.
 
     Raises:
-        DataError: it was begun otherwise, holds other things, or another process works on it.
+        DataError: it was begun with others, holds other things, or another process works on it.
     """
     record = SettingsRecord(output / MARKER)
     is_new = not record.path.exists() and output.exists()
@@ -143,10 +143,10 @@ def claimed(output: Path, settings: PrepareSettings, sources: dict[str, Any]) ->
 
 @dataclass
 class Preparation:
-    """The steps, each of which leaves alone what is done.
+    """The steps of a preparation; each does only what is not done yet.
 
     Attributes:
-        output: the prepared folder, claimed.
+        output: the prepared folder, locked.
         settings: of the preparation.
         sources: what to prepare.
         work: ``work_on`` with its processes chosen.
@@ -157,8 +157,8 @@ class Preparation:
     sources: Sources
     work: Callable[..., Iterator[tuple[str, str | None]]]
 
-    def say_estimate(self, processes: int) -> None:
-        """Log how large and how long what is missing will be."""
+    def log_estimate(self, processes: int) -> None:
+        """Log how much disk space and time the scans and models that are missing will take."""
         jobs = [
             job for job in self.sources.selection.jobs if not scan_folder(self.output, job.scene_id).is_dir()
         ]
@@ -169,11 +169,11 @@ class Preparation:
             if not has_model(copies, *model.split("/"))
         ]
         if jobs:
-            said = estimate(
+            expected = estimate(
                 jobs, models, self.output, self.settings, shapenet=self.sources.shapenet, processes=processes
             )
-            _log.info("%s", said)
-            if said.num_bytes > said.free:
+            _log.info("%s", expected)
+            if expected.num_bytes > expected.free:
                 _log.warning("the disk of %s will be full before that", self.output)
 
     def run(self, grid_extent: tuple[float, float, float]) -> dict[str, Any]:
@@ -203,14 +203,14 @@ class Preparation:
     def _finished(self) -> list[str]:
         """Return the prepared scans, also those of earlier calls."""
         folder = self.output / "scannet" / "scans"
-        found = folder.iterdir() if folder.is_dir() else ()
-        return sorted(path.name for path in found if not path.name.startswith("."))
+        paths = folder.iterdir() if folder.is_dir() else ()
+        return sorted(path.name for path in paths if not path.name.startswith("."))
 
     def _entries(self) -> dict[str, Entry]:
         """Return the annotation of all scans that are to be prepared or are."""
-        known = {} if self.sources.annotations is None else self.sources.annotations.entries
-        wanted = {job.scene_id for job in self.sources.selection.jobs} | set(self._finished())
-        return {scan: known[scan] for scan in sorted(wanted & known.keys())}
+        entries = {} if self.sources.annotations is None else self.sources.annotations.entries
+        scans = {job.scene_id for job in self.sources.selection.jobs} | set(self._finished())
+        return {scan: entries[scan] for scan in sorted(scans & entries.keys())}
 
     def _copy_models(self, models: Sequence[str]) -> dict[str, str]:
         """Return what is wrong with each CAD model that cannot be used."""
@@ -232,10 +232,10 @@ class Preparation:
         """Write the annotation and the split files of the prepared scans."""
         present = set(scans)
         if self.sources.annotations is not None:
-            kept = [entries[scan] for scan in scans if scan in entries]
-            write_text(self.output / "scan2cad" / ANNOTATIONS, json.dumps(kept))
+            prepared = [entries[scan] for scan in scans if scan in entries]
+            write_text(self.output / "scan2cad" / ANNOTATIONS, json.dumps(prepared))
         for split, names in self.sources.listed.items():
-            there = [scan for scan in names if scan in present]
-            if there or split in self.sources.selection.splits:
-                lines = "".join(f"{scan}\n" for scan in there)
+            listed = [scan for scan in names if scan in present]
+            if listed or split in self.sources.selection.splits:
+                lines = "".join(f"{scan}\n" for scan in listed)
                 write_text(self.output / "scannet" / f"scannetv2_{split}.txt", lines)

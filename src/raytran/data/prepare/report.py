@@ -11,6 +11,7 @@ from textwrap import fill
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from raytran.data.files import bytes_below
 from raytran.data.prepare.annotation import Annotations, Entry, LeftOut
@@ -59,14 +60,14 @@ _NOTICED = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a preparation led to.
+    """Which scans and objects a preparation used, and which not.
 
     Attributes:
-        scans: prepared scans, those of earlier calls among them.
-        entries: annotation of those that have one.
+        scans: all prepared scans, also those of earlier calls.
+        entries: annotation of the prepared scans that have one.
         left_out: objects without a usable CAD file.
         without_objects: scans that are not prepared because none of their objects can be used.
-        failed: scans that cannot be used, and why.
+        failed: scans that cannot be used, with the reason.
     """
 
     scans: Sequence[str]
@@ -79,15 +80,16 @@ class Outcome:
 def make_report(
     output: Path, sources: Sources, outcome: Outcome, *, grid_extent: tuple[float, float, float]
 ) -> dict[str, Any]:
-    """Collect what is known about a prepared folder; the same files give the same report.
+    """Return the content of ``report.json``; the same files give the same report.
 
     Args:
         output: the prepared folder.
         sources: what it was prepared from.
-        outcome: what became of it.
+        outcome: which scans and objects were used.
         grid_extent: sizes of the volume, metres.
     """
-    selection, found = sources.selection, sources.annotations or Annotations()
+    selection = sources.selection
+    annotations = sources.annotations or Annotations()
     facts = {scan: read_facts(output, scan) for scan in outcome.scans}
     annotated = {scan: parse_entry(entry) for scan, entry in outcome.entries.items()}
     objects = {scan: scene_objects(annotation) for scan, annotation in annotated.items()}
@@ -100,19 +102,19 @@ def make_report(
         "left_out": {
             "scans_failed": dict(sorted(outcome.failed.items())),
             "scans_without_annotation": selection.without_annotation,
-            "scans_annotated_without_objects": sorted(found.empty),
+            "scans_annotated_without_objects": sorted(annotations.empty),
             "scans_without_usable_objects": list(outcome.without_objects),
             "annotations_without_scan": selection.without_scan,
             "scans_in_no_split": selection.in_no_split,
-            "objects": [asdict(part) for part in (*found.left_out, *outcome.left_out)],
+            "objects": [asdict(item) for item in (*annotations.left_out, *outcome.left_out)],
         },
         "noticed": {
             "duplicate_scans": selection.duplicates,
-            "duplicate_annotations": found.twice,
-            "recordings_cut_short": _facts_that_say("cut", facts),
-            "other_source_used": _facts_that_say("failed_sources", facts),
-            **_conspicuous_objects(facts, annotated, grid_extent),
-            "damaged_images": _facts_that_say("damaged", facts),
+            "duplicate_annotations": annotations.twice,
+            "recordings_cut_short": _facts_with("cut", facts),
+            "other_source_used": _facts_with("failed_sources", facts),
+            **_odd_objects(annotated, objects, facts, grid_extent),
+            "damaged_images": _facts_with("damaged", facts),
         },
     }
 
@@ -143,7 +145,7 @@ def _frames(facts: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
 
 
 def _sizes(output: Path, facts: Mapping[str, dict[str, Any]]) -> dict[str, int]:
-    """Return bytes of files; those of the frames from the scans' facts, for there are many."""
+    """Return bytes of files; the many frames are not counted again, their scans' facts have the sum."""
     return {
         "color_bytes": sum(f["bytes"] for f in facts.values()),
         "model_bytes": bytes_below(output / "shapenet"),
@@ -151,16 +153,14 @@ def _sizes(output: Path, facts: Mapping[str, dict[str, Any]]) -> dict[str, int]:
     }
 
 
-def _conspicuous_objects(
-    facts: Mapping[str, dict[str, Any]],
+def _odd_objects(
     annotated: Mapping[str, SceneAnnotation],
-    extent: tuple[float, float, float],
+    objects: Mapping[str, ObjectSet],
+    facts: Mapping[str, dict[str, Any]],
+    grid_extent: tuple[float, float, float],
 ) -> dict[str, dict[str, list[str]]]:
-    """Return the models that are odd in each of three ways, by scan.
-
-    They lie outside of the volume around the mean of all cameras, are mirrored, or have no thickness.
-    """
-    half = torch.tensor(extent, dtype=torch.float64) / 2
+    """Return the models outside the volume around the cameras, mirrored, or without thickness, by scan."""
+    half = torch.tensor(grid_extent, dtype=torch.float64) / 2
     odd: dict[str, dict[str, list[str]]] = {
         "objects_outside_volume": {},
         "objects_mirrored": {},
@@ -168,21 +168,27 @@ def _conspicuous_objects(
     }
     for scan, annotation in annotated.items():
         volume_center = torch.tensor(facts[scan]["camera_center"], dtype=torch.float64)
-        offset = scene_objects(annotation).center.double() - volume_center
-        tests = (
-            (offset.abs() > half).any(dim=1),
-            torch.linalg.det(annotation.scan_from_cad[:, :3, :3]) < 0,
-            (annotation.box_half_size <= 0).any(dim=1),
-        )
-        for scans, is_odd in zip(odd.values(), tests, strict=True):
-            models = [annotation.model_id[i] for i in is_odd.nonzero().flatten().tolist()]
-            if models:
-                scans[scan] = models
+        offset = (objects[scan].center.double() - volume_center).abs()
+        is_mirrored = torch.linalg.det(annotation.scan_from_cad[:, :3, :3]) < 0
+        is_flat = (annotation.box_half_size <= 0).any(dim=1)
+        models = {
+            "objects_outside_volume": _chosen(objects[scan].model_id, (offset > half).any(dim=1)),
+            "objects_mirrored": _chosen(annotation.model_id, is_mirrored),
+            "objects_flat": _chosen(annotation.model_id, is_flat),
+        }
+        for what, names in models.items():
+            if names:
+                odd[what][scan] = names
     return odd
 
 
-def _facts_that_say(key: str, facts: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
-    return {scan: f[key] for scan, f in facts.items() if f[key]}
+def _chosen(names: Sequence[str], is_chosen: Tensor) -> list[str]:
+    return [names[i] for i in is_chosen.nonzero().flatten().tolist()]
+
+
+def _facts_with(key: str, facts: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return the entry ``key`` of the scans in whose facts it is not empty."""
+    return {scan: facts_of_scan[key] for scan, facts_of_scan in facts.items() if facts_of_scan[key]}
 
 
 def report_text(report: Mapping[str, Any]) -> str:
@@ -240,21 +246,21 @@ def _paper(split: str) -> str:
 
 def _objects_left_out(objects: Iterable[Mapping[str, str]]) -> list[str]:
     by_reason: dict[str, list[str]] = {}
-    for part in objects:
-        name = f"{part['scan']}: {part['model']}" if part["model"] else part["scan"]
-        by_reason.setdefault(part["reason"], []).append(name)
+    for item in objects:
+        name = f"{item['scan']}: {item['model']}" if item["model"] else item["scan"]
+        by_reason.setdefault(item["reason"], []).append(name)
     return [line for reason, names in by_reason.items() for line in _named(f"objects, {reason}", names)]
 
 
 def _named(what: str, names: Sequence[str] | Mapping[str, Any]) -> list[str]:
-    """Return a line with the count, and the first names, with what is wrong with each where that is known."""
+    """Return a line with the count and lines with the first names, each with its reason if there is one."""
     if not names:
         return []
-    known = names if isinstance(names, Mapping) else {}
+    reasons = names if isinstance(names, Mapping) else {}
     first = list(names)[:_NAMES_SHOWN]
     rest = [f"… and {len(names) - len(first)} more in report.json"] if len(names) > len(first) else []
-    if any(isinstance(known.get(name), str) for name in first):
-        lines = [*(f"{name}: {known[name]}" for name in first), *rest]
+    if any(isinstance(reasons.get(name), str) for name in first):
+        lines = [*(f"{name}: {reasons[name]}" for name in first), *rest]
     else:
         text = ", ".join(first + rest)
         lines = fill(text, _WIDTH - 4, break_long_words=False, break_on_hyphens=False).splitlines()

@@ -27,17 +27,17 @@ from raytran.errors import ConfigError, DataError
 from raytran.geometry.camera import Cameras
 
 FACTS = "prepared.json"
-"""What became of a scan's frames; part of its prepared folder."""
+"""File in a prepared scan's folder that says what became of its frames."""
 
 JPEG_QUALITY = 90
-"""Of frames that were resized; ones that have the right size already keep their bytes."""
+"""Of resized frames; a frame that has the right size already keeps its bytes."""
 
 _PNG = b"\x89PNG"
 
 
 @dataclass(frozen=True)
 class PrepareSettings:
-    """What decides the bytes of a prepared scan.
+    """The settings on which the bytes of a prepared scan depend.
 
     Attributes:
         image_size: ``(H, W)`` of the frames.
@@ -72,7 +72,7 @@ def scan_folder(output: Path, scene_id: str) -> Path:
 
 
 def prepare_scan(job: ScanJob, output: Path, settings: PrepareSettings) -> tuple[str, str | None]:
-    """Prepare a scan unless it is there; if the best source fails the next is tried.
+    """Prepare a scan unless it is prepared already; if the best source fails the next is tried.
 
     Returns:
         the scan and, if none of its sources can be used, why.
@@ -102,7 +102,7 @@ def prepare_scan(job: ScanJob, output: Path, settings: PrepareSettings) -> tuple
 
 
 def read_facts(output: Path, scene_id: str) -> dict[str, Any]:
-    """Return what is known about a prepared scan's frames.
+    """Return the facts of a prepared scan's frames, see ``FACTS``.
 
     Raises:
         DataError: the file is missing or damaged.
@@ -218,9 +218,11 @@ def choose_frames(count: int, max_frames: int | None) -> list[int]:
 
 def frame_names(frame_ids: Sequence[str]) -> list[str]:
     """Return the number in each frame's name, ``000010`` becomes ``10``; the names if two have the same."""
-    numbers = [re.findall(r"\d+", name) for name in frame_ids]
-    plain = [str(int(found[-1])) if found else name for found, name in zip(numbers, frame_ids, strict=True)]
-    return plain if len(set(plain)) == len(plain) else list(frame_ids)
+    short = []
+    for name in frame_ids:
+        numbers = re.findall(r"\d+", name)
+        short.append(str(int(numbers[-1])) if numbers else name)
+    return short if len(set(short)) == len(short) else list(frame_ids)
 
 
 def encoded_frame(scan: OpenScan, position: int, image_size: tuple[int, int]) -> tuple[bytes, str]:

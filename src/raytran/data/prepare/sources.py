@@ -18,7 +18,7 @@ from raytran.errors import ConfigError, DataError
 
 @dataclass(frozen=True)
 class Released:
-    """Where the released files lie, and which of them to take.
+    """Paths of the released files, and which scans to prepare from them.
 
     Attributes:
         scannet: folder with scans in any released form, however nested.
@@ -37,15 +37,15 @@ class Released:
 
 @dataclass(frozen=True)
 class Selection:
-    """The scans to prepare, and what was noticed on the way.
+    """The scans to prepare, and what the report says of the others.
 
     Attributes:
-        jobs: by name.
+        jobs: the scans to prepare, in the order of their names.
         splits: scans of each split that was asked for, in the order of its file; empty without split files.
-        without_annotation: scans that are there but have no annotation, so they are not prepared.
-        without_scan: annotated scans of these splits that are not there.
-        duplicates: places of each scan that is there several times, the one that is taken first.
-        in_no_split: scans that are there but in no split file.
+        without_annotation: scans on disk that have no annotation, so they are not prepared.
+        without_scan: annotated scans of these splits that are not on disk.
+        duplicates: paths of each scan that is on disk several times, the one that is taken first.
+        in_no_split: scans on disk that no split file lists.
     """
 
     jobs: tuple[ScanJob, ...]
@@ -58,11 +58,11 @@ class Selection:
 
 @dataclass(frozen=True)
 class Sources:
-    """What was recognised.
+    """What the released files were recognised as.
 
     Attributes:
         annotation_path: the annotation file; None if there is none.
-        annotations: what can be used of it.
+        annotations: its usable entries; None if there is no file.
         shapenet: folder of the CAD models.
         version: which release of ShapeNetCore it is; None without one.
         listed: scans of each split file.
@@ -85,11 +85,11 @@ class Sources:
 
 
 def read_sources(released: Released, output: Path) -> Sources:
-    """Find out what was given.
+    """Recognise the released files, and choose the scans to prepare.
 
     Args:
         released: paths and choices.
-        output: folder to leave out if it lies among the scans.
+        output: the prepared folder, which is left out if it lies among the scans.
 
     Raises:
         ConfigError: the choices contradict each other.
@@ -113,16 +113,17 @@ def read_sources(released: Released, output: Path) -> Sources:
     return Sources(path, annotations, shapenet, version, listed, selection)
 
 
-def _outside(output: Path, found: Mapping[str, Sequence[ScanSource]]) -> dict[str, tuple[ScanSource, ...]]:
+def _outside(output: Path, scans: Mapping[str, Sequence[ScanSource]]) -> dict[str, tuple[ScanSource, ...]]:
+    """Return the sources of each scan that do not lie in the prepared folder."""
     others = {
-        scan: tuple(s for s in sources if not s.path.resolve().is_relative_to(output))
-        for scan, sources in found.items()
+        scan: tuple(source for source in sources if not source.path.resolve().is_relative_to(output))
+        for scan, sources in scans.items()
     }
     return {scan: sources for scan, sources in others.items() if sources}
 
 
 def select_scans(
-    found: Mapping[str, Sequence[ScanSource]],
+    sources: Mapping[str, Sequence[ScanSource]],
     listed: Mapping[str, Sequence[str]],
     annotations: Annotations | None,
     *,
@@ -136,7 +137,7 @@ def select_scans(
     are no annotations at all.
 
     Args:
-        found: sources of each scan, best first.
+        sources: of each scan on disk, best first.
         listed: scans of each split file; empty if there are none, and then every scan counts.
         annotations: None if none are given.
         root: where scans were looked for.
@@ -147,18 +148,19 @@ def select_scans(
         ConfigError: an unknown split.
         DataError: a name in ``scenes`` matches nothing, or no scan is left.
     """
-    if unknown := set(splits) - set(SPLITS):
+    unknown = set(splits) - set(SPLITS)
+    if unknown:
         raise ConfigError(f"unknown splits {sorted(unknown)}: choose from {', '.join(SPLITS)}")
     lists = {split: list(listed.get(split, ())) for split in SPLITS if split in splits}
-    in_scope = {scan for scans in lists.values() for scan in scans} if listed else set(found)
+    in_scope = {scan for scans in lists.values() for scan in scans} if listed else set(sources)
     entries: Mapping[str, Entry] = {} if annotations is None else annotations.entries
     if scenes is not None:
-        in_scope &= set(_named(scenes, [*found, *entries], in_scope, root, splits))
-    chosen = sorted(in_scope & set(found))
-    bare = [scan for scan in chosen if annotations is not None and scan not in entries]
-    skipped = bare if scenes is None else []
+        in_scope &= set(_named(scenes, [*sources, *entries], in_scope, root, splits))
+    chosen = sorted(in_scope & set(sources))
+    without_annotation = [scan for scan in chosen if annotations is not None and scan not in entries]
+    skipped = without_annotation if scenes is None else []
     jobs = tuple(
-        ScanJob(scan, tuple(found[scan]), entries.get(scan)) for scan in chosen if scan not in skipped
+        ScanJob(scan, tuple(sources[scan]), entries.get(scan)) for scan in chosen if scan not in skipped
     )
     if not jobs:
         raise _nothing_left(set(chosen), root)
@@ -166,10 +168,14 @@ def select_scans(
     return Selection(
         jobs=jobs,
         splits=lists if listed else {},
-        without_annotation=bare,
-        without_scan=sorted((in_scope if listed else set(entries)) & set(entries) - set(found)),
-        duplicates={scan: [_place(s, root) for s in found[scan]] for scan in chosen if len(found[scan]) > 1},
-        in_no_split=sorted(set(found) - in_lists) if listed else [],
+        without_annotation=without_annotation,
+        without_scan=sorted((in_scope if listed else set(entries)) & set(entries) - set(sources)),
+        duplicates={
+            scan: [_described(source, root) for source in sources[scan]]
+            for scan in chosen
+            if len(sources[scan]) > 1
+        },
+        in_no_split=sorted(set(sources) - in_lists) if listed else [],
     )
 
 
@@ -188,10 +194,10 @@ def _named(
     return [scan for scans in matches.values() for scan in scans]
 
 
-def _nothing_left(there: set[str], root: Path) -> DataError:
-    if there:
+def _nothing_left(chosen: set[str], root: Path) -> DataError:
+    if chosen:
         return DataError(
-            f"none of the {len(there)} chosen scans in {root} has objects in the annotations: "
+            f"none of the {len(chosen)} chosen scans in {root} has objects in the annotations: "
             "check that the files belong together"
         )
     return DataError(
@@ -199,6 +205,7 @@ def _nothing_left(there: set[str], root: Path) -> DataError:
     )
 
 
-def _place(source: ScanSource, root: Path) -> str:
+def _described(source: ScanSource, root: Path) -> str:
+    """Return form and path of a source, for the report."""
     path = source.path
     return f"{source.form}: {path.relative_to(root) if path.is_relative_to(root) else path}"

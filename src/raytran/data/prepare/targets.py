@@ -19,7 +19,7 @@ _MASKS_AT_ONCE = 20
 
 
 def prepare_model(model_id: str, source: Path, output: Path) -> tuple[str, str | None]:
-    """Copy a model unless it is there, and keep its shape among the targets.
+    """Copy a model unless that is done, and cache its shape, a training target.
 
     Args:
         model_id: ``catid/id``.
@@ -46,7 +46,7 @@ def prepare_model(model_id: str, source: Path, output: Path) -> tuple[str, str |
 
 
 def write_masks(entry: Entry, cameras: Cameras, output: Path) -> None:
-    """Make the amodal masks that a data set will ask for.
+    """Make the amodal masks that training will need, and cache them.
 
     Args:
         entry: annotation of the scan.
@@ -58,19 +58,15 @@ def write_masks(entry: Entry, cameras: Cameras, output: Path) -> None:
     """
     objects = scene_objects(parse_entry(entry))
     cache = MaskCache(folder=output / "cache")
-    parts = zip(
-        cameras.intrinsics.float().split(_MASKS_AT_ONCE),
-        cameras.world_from_camera.float().split(_MASKS_AT_ONCE),
-        strict=True,
-    )
-    for part in parts:
-        foreground_masks(
-            objects, Cameras(*part, cameras.image_size), shapenet_root=output / "shapenet", cache=cache
-        )
+    for start in range(0, len(cameras.intrinsics), _MASKS_AT_ONCE):
+        frames = slice(start, start + _MASKS_AT_ONCE)
+        intrinsics, pose = cameras.intrinsics[frames].float(), cameras.world_from_camera[frames].float()
+        chunk = Cameras(intrinsics, pose, cameras.image_size)
+        foreground_masks(objects, chunk, shapenet_root=output / "shapenet", cache=cache)
 
 
 def check_disk(error: BaseException, output: Path) -> None:
-    """Raise one sentence if ``error`` comes from a full or read-only disk.
+    """Raise an error for the user if ``error`` comes from a full or read-only disk.
 
     Raises:
         DataError: it does.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finding scans and split files below a ScanNet root, however it is nested."""
+"""Finds scans and split files below a ScanNet root, however it is nested."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from raytran.errors import DataError
 _log = logging.getLogger(__name__)
 
 SOURCE_FORMS: tuple[str, ...] = ("sens", *FORMS)
-"""Forms of a scan, the one to prefer first."""
+"""Forms of a scan, in the order of preference."""
 
 SPLITS: tuple[str, ...] = ("train", "val", "test")
 
@@ -31,7 +31,7 @@ _SPLIT_FOLDERS = (".", "splits", "meta_data", "Tasks/Benchmark", "tasks/benchmar
 
 @dataclass(frozen=True)
 class ScanSource:
-    """A place from which a scan can be read.
+    """A folder or file from which a scan can be read.
 
     Attributes:
         scene_id: name of the scan.
@@ -95,11 +95,11 @@ def find_scans(root: Path) -> dict[str, tuple[ScanSource, ...]]:
     if not root.is_dir():
         raise DataError(f"there is no folder {root}: check the path of ScanNet")
     walk = _Walk()
-    found = list(walk.scans(root / "scannet" if (root / "scannet").is_dir() else root))
-    if not found:
+    every_source = list(walk.scans(root / "scannet" if (root / "scannet").is_dir() else root))
+    if not every_source:
         raise DataError(f"{root} holds {Listing.of(root).summary()}, so no scans that can be read: {WANTED}")
     by_scan: defaultdict[str, list[ScanSource]] = defaultdict(list)
-    for source in found:
+    for source in every_source:
         by_scan[source.scene_id].append(
             replace(source, header=source.header or walk.headers.get(source.scene_id))
         )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which of ScanNet's exported forms a folder has, and where its images, poses and intrinsics lie."""
+"""Recognises in which of ScanNet's exported forms a folder is: where its images, poses and intrinsics lie."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from raytran.data.scannet.text import INFO_FILES
 from raytran.errors import DataError
 
 FORMS: tuple[str, ...] = ("exporter", "cpp", "odam", "mmdetection3d", "frames_25k")
-"""Exported forms, the one to prefer first.
+"""Exported forms, in the order of preference.
 
 ``exporter``: ScanNet's Python exporter, ``color/<n>.jpg``, ``pose/<n>.txt``, ``intrinsic/``. ``cpp``: its C++
 tool, ``frame-<n>.color.jpg``, ``frame-<n>.pose.txt``, ``_info.txt``. ``odam``: the first, inside ``frames/``.
@@ -73,10 +73,10 @@ class Listing:
     def summary(self) -> str:
         """Return what the folder holds, in a few words."""
         endings = Counter(Path(name).suffix or "without ending" for name in self.files)
-        parts = [f"the folder {name}" for name in sorted(self.folders)[:6]]
-        parts += ["more folders"] if len(self.folders) > 6 else []
-        parts += [f"{count} files {ending}" for ending, count in endings.most_common(4)]
-        return ", ".join(parts) or "nothing"
+        contents = [f"the folder {name}" for name in sorted(self.folders)[:6]]
+        contents += ["more folders"] if len(self.folders) > 6 else []
+        contents += [f"{count} files {ending}" for ending, count in endings.most_common(4)]
+        return ", ".join(contents) or "nothing"
 
 
 @dataclass(frozen=True)
@@ -115,19 +115,21 @@ class Layout:
     def intrinsics(self) -> Path:
         """Return the first file of intrinsics that is there, or where the exporter would write it."""
         folders = dict.fromkeys((self.base, self.scan))
-        found = (folder / name for folder in folders for name in _INTRINSICS if (folder / name).is_file())
-        return next(found, self.base / _INTRINSICS[0])
+        paths = (folder / name for folder in folders for name in _INTRINSICS)
+        return next((path for path in paths if path.is_file()), self.base / _INTRINSICS[0])
 
     def num_images(self) -> int:
         """Return the number of colour images without opening any."""
         return len(self.images())
 
-    def _cpp(self, part: str, endings: tuple[str, ...]) -> dict[str, Path]:
+    def _cpp(self, kind: str, endings: tuple[str, ...]) -> dict[str, Path]:
+        """Return the files ``frame-<n>.<kind>.*`` by frame."""
         matches = (_CPP_FRAME.fullmatch(name) for name in Listing.of(self.base).files)
-        wanted = ((m, f".{m[3].lower()}") for m in matches if m and m[2] == part)
-        return _pick(endings, ((m[1], self.base / m.string, ending) for m, ending in wanted))
+        of_kind = ((m, f".{m[3].lower()}") for m in matches if m and m[2] == kind)
+        return _pick(endings, ((m[1], self.base / m.string, ending) for m, ending in of_kind))
 
     def _flat(self, endings: tuple[str, ...]) -> dict[str, Path]:
+        """Return the files ``<n>.*`` by frame."""
         matches = (_FLAT_FRAME.fullmatch(name) for name in Listing.of(self.base).files)
         return _pick(endings, ((m[1], self.base / m.string, f".{m[2].lower()}") for m in matches if m))
 
@@ -135,12 +137,12 @@ class Layout:
 def recognise(listing: Listing) -> Layout | None:
     """Return the layout of a scan's folder, or None if it holds no frames.
 
-    A part may still be missing: a folder with images but no poses is recognised, so that reading it names
-    what is not there.
+    Images, poses or intrinsics may be missing: such a folder is recognised too, so that reading it names what
+    is missing.
     """
-    own = _form(listing)
-    if own is not None:
-        return Layout(own, listing.path, listing.path)
+    form = _form(listing)
+    if form is not None:
+        return Layout(form, listing.path, listing.path)
     for name in INNER_FOLDERS:
         if name in listing.folders:
             inner = Listing.of(listing.path / name)
@@ -185,6 +187,6 @@ def _by_stem(folder: Path, endings: tuple[str, ...]) -> dict[str, Path]:
 
 
 def _pick(endings: tuple[str, ...], files: Iterable[tuple[str, Path, str]]) -> dict[str, Path]:
-    """Return the path of each name; of several endings, the one that comes last in ``endings``."""
+    """Return the path of each name; if it has several endings, that which comes last in ``endings``."""
     fitting = [(endings.index(ending), name, path) for name, path, ending in files if ending in endings]
     return {name: path for _, name, path in sorted(fitting)}

@@ -29,7 +29,7 @@ from raytran.structs import Views
 _log = logging.getLogger(__name__)
 
 CUT = "the file ends here"
-"""Reason for which the frames after the end of a damaged recording are dropped."""
+"""Reason why the frames after the end of a damaged recording are dropped."""
 
 _NO_MATRIX = np.full((4, 4), np.nan)
 

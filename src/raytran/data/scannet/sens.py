@@ -30,7 +30,7 @@ _MAX_NAME = 4096
 _MAX_FRAMES = 1_000_000
 """Ten hours of video; an index of so many frames takes 88 MB."""
 _MAX_BYTES_PER_PIXEL = 8
-"""No JPEG, PNG or zlib stream of a real frame needs more; a larger blob is damage and is never read."""
+"""No JPEG, PNG or zlib stream of a real frame has more; a larger one is damaged and is never read."""
 
 
 class SensFile:
@@ -200,13 +200,14 @@ class SensFile:
     def _read_at(self, offset: int, num_bytes: int) -> bytes:
         try:
             self._file.seek(offset)
-            parts, missing = [], num_bytes
-            while missing and (part := self._file.read(missing)):
-                parts.append(part)
-                missing -= len(part)
+            # An unbuffered file may return less than was asked for.
+            pieces, missing = [], num_bytes
+            while missing and (piece := self._file.read(missing)):
+                pieces.append(piece)
+                missing -= len(piece)
         except OSError as error:
             raise DataError(f"cannot read {self.path} ({error.strerror}): copy it again") from error
-        return b"".join(parts)
+        return b"".join(pieces)
 
     def _read_header(self) -> int:
         """Read what comes before the frames and return the offset of the first."""
@@ -249,9 +250,13 @@ class SensFile:
 
     @cached_property
     def _index(self) -> tuple[NDArray[np.float64], NDArray[np.uint64]]:
-        """Hop from frame to frame, as far as whole ones go; return poses and (start, colour, depth) bytes."""
+        """Read the header of every whole frame; return poses, and where data start and how long they are.
+
+        Returns:
+            ``(n, 4, 4)`` poses and ``(n, 3)``: offset of the colour, bytes of colour, bytes of depth.
+        """
         offset = self._first_frame
-        poses, blobs = bytearray(), bytearray()
+        poses, extents = bytearray(), bytearray()
         for count in range(self.num_stated):
             raw = self._read_at(offset, _FRAME_HEADER.size)
             if len(raw) < _FRAME_HEADER.size:
@@ -264,8 +269,8 @@ class SensFile:
             if count == _MAX_FRAMES:
                 raise DataError(f"{self.path} has more than {_MAX_FRAMES} frames: no scan is that long")
             poses += pose
-            blobs += struct.pack("=3Q", start, num_color, num_depth)
-        table = np.frombuffer(blobs, "=u8").reshape(-1, 3)
+            extents += struct.pack("=3Q", start, num_color, num_depth)
+        table = np.frombuffer(extents, "=u8").reshape(-1, 3)
         # In a damaged file a pose may be a signalling NaN, which the conversion would warn of.
         with np.errstate(invalid="ignore"):
             return np.frombuffer(poses, "<f4").reshape(-1, 4, 4).astype(np.float64), table

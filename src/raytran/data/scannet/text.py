@@ -16,9 +16,9 @@ INFO_FILES = ("_info.txt", "info.txt")
 """Names of the C++ exporter's file of facts."""
 
 _MAX_BYTES = 1 << 20
-"""Of a file that are looked at; those of ScanNet have some hundred."""
+"""Bytes of a file that are read; ScanNet's files have some hundred."""
 
-_OFF_CENTRE = 0.15
+_MAX_OFFSET = 0.15
 """Largest distance of the principal point from the image centre, in widths or heights."""
 
 
@@ -31,11 +31,11 @@ def read_matrix(path: Path) -> NDArray[np.float64] | None:
 
 
 def are_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return for each of ``(n, 4, 4)`` matrices whether it is finite, and its rotation is one."""
+    """Return which of ``(n, 4, 4)`` matrices are finite and hold a rotation in their upper left, ``(n,)``."""
     finite = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
-    turn = np.where(finite[:, None, None], poses[:, :3, :3], 0.0)
-    error = np.abs(turn @ turn.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
-    return finite & (error < 0.01) & (np.linalg.det(turn) > 0)
+    rotation = np.where(finite[:, None, None], poses[:, :3, :3], 0.0)
+    error = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
+    return finite & (error < 0.01) & (np.linalg.det(rotation) > 0)
 
 
 def read_header(path: Path) -> dict[str, str]:
@@ -96,8 +96,8 @@ def check_intrinsics(
         matrix: 4×4.
         path: where it was read, for errors.
         image_size: ``(H, W)`` of the stored images.
-        header: lines of ``<scan>.txt``; its ``colorWidth`` and ``colorHeight`` are what else they may be for.
-        any_size: accept those for another image size, which the data doctor then names.
+        header: lines of ``<scan>.txt``, whose ``colorWidth`` and ``colorHeight`` may be another image size.
+        any_size: accept intrinsics for another image size, as the data doctor does to name the fault.
 
     Raises:
         DataError: they are not finite, not positive, or for another image size.
@@ -110,16 +110,16 @@ def check_intrinsics(
     if any_size:
         return torch.from_numpy(matrix[:3, :3].copy())
     height, width = image_size
-    off = _distance_from_centre(matrix, width, height)
+    distance = _distance_from_centre(matrix, width, height)
     try:
         stated = int(header.get("colorWidth", width)), int(header.get("colorHeight", height))
     except ValueError:
         stated = width, height
     # A header may state 0 for a size it does not know.
-    for_stated_size = (
-        min(stated) > 0 and stated != (width, height) and _distance_from_centre(matrix, *stated) < off
+    fits_stated_size = (
+        min(stated) > 0 and stated != (width, height) and _distance_from_centre(matrix, *stated) < distance
     )
-    if off > _OFF_CENTRE or for_stated_size:
+    if distance > _MAX_OFFSET or fits_stated_size:
         raise DataError(
             f"{path} has its principal point at ({matrix[0, 2]:.1f}, {matrix[1, 2]:.1f}), so it is for "
             f"another image size than the stored {width}x{height}: "

@@ -138,11 +138,11 @@ def _parse(path: Path, vertices: array[float], corners: array[int]) -> str:
                 f"the CAD model {path} has more than {_MAX_ELEMENTS:,} vertices or triangles: simplify it or "
                 "leave it out"
             )
-    found = {b"vertex positions": len(vertices) // 3, b"faces": elements}
+    counted = {b"vertex positions": len(vertices) // 3, b"faces": elements}
     lacking = [
-        f"{found[kind]:,} of {number:,} {kind.decode()}"
+        f"{counted[kind]:,} of {number:,} {kind.decode()}"
         for kind, number in expected.items()
-        if number > found[kind]
+        if number > counted[kind]
     ]
     return " and ".join(lacking)
 
@@ -332,6 +332,6 @@ def write_binvox(path: Path, cells: NDArray[np.bool_], translate: ArrayLike, sca
     counts[np.cumsum(pieces) - 1] = (lengths - 1) % 255 + 1
     runs = np.stack([np.repeat(flat[starts], pieces).astype(np.uint8), counts], axis=1)
     sides = " ".join([str(cells.shape[0])] * 3)
-    place = " ".join(repr(float(value)) for value in np.asarray(translate))
-    header = f"#binvox 1\ndim {sides}\ntranslate {place}\nscale {float(scale)!r}\ndata\n"
+    corner = " ".join(repr(float(value)) for value in np.asarray(translate))
+    header = f"#binvox 1\ndim {sides}\ntranslate {corner}\nscale {float(scale)!r}\ndata\n"
     path.write_bytes(header.encode("ascii") + runs.tobytes())

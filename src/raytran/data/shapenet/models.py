@@ -88,7 +88,7 @@ def shapenet_version(root: Path) -> Version:
 
 
 def has_model(root: Path, catid: str, model_id: str) -> bool:
-    """Tell whether the mesh file of a model is there; it is not opened."""
+    """Return whether the mesh file of a model exists; it is not opened."""
     return _find_mesh(root, catid, model_id) is not None
 
 
@@ -98,7 +98,7 @@ def categories(root: Path) -> list[str]:
 
 
 def model_names(root: Path, catid: str) -> list[str]:
-    """Return the names of all models of a category whose mesh file is there, of either release, sorted."""
+    """Return the names of all models of a category that have a mesh file, of either release, sorted."""
     folders = {folder.name for nest in _NESTS for folder in (root / nest / catid).glob("*/")}
     return sorted(name for name in folders if has_model(root, catid, name))
 
@@ -145,7 +145,7 @@ def read_mesh(root: Path, catid: str, model_id: str) -> trimesh.Trimesh:
 
 
 def read_facts(root: Path, catid: str, model_id: str) -> ModelFacts:
-    """Read what is known of a model before it was normalised: for v1, the mesh as it is, turned to v2's axes.
+    """Read the facts of a model before it was normalised; of v1, those of the mesh rotated to v2's axes.
 
     Raises:
         DataError: the file is missing or damaged.
@@ -171,9 +171,9 @@ def read_facts(root: Path, catid: str, model_id: str) -> ModelFacts:
 def copy_model(root: Path, catid: str, model_id: str, output_root: Path) -> Path:
     """Copy a model to ``output_root/<catid>/<id>/models`` as ShapeNetCore v2 has it, and return that folder.
 
-    Mesh, materials, facts and solid voxels are kept (the last three where there are any), textures are not.
-    Files of v2 are copied as they are; a model of v1 is turned and normalised. A folder that is already
-    there is left alone, and it appears only when it is whole, so several processes may copy the same model.
+    Mesh, materials, facts and solid voxels are copied (the last three if they exist), textures are not. Files
+    of v2 are copied as they are; a model of v1 is rotated and normalised. A folder that exists is left as it
+    is, and it appears only when it is whole, so several processes may copy the same model.
 
     Raises:
         DataError: the mesh is missing, damaged or without faces.
@@ -254,13 +254,13 @@ def _convert_v1(path: Path, vertices: NDArray[np.float64], model_id: str, files:
 
 
 def _turn_voxels(path: Path, facts: ModelFacts, output: Path) -> None:
-    """Write the voxels of v1 in the frame of v2; damaged ones are left out, as training needs none."""
+    """Write the voxels of v1 in the frame of v2; damaged ones are not written, as training needs none."""
     try:
         cells, translate, scale = read_binvox(path)
     except DataError as error:
         _log.warning("left out: %s", error)
         return
-    # The cube's lower corner after the turn: z runs against the old x.
+    # The cube's lower corner after the rotation: z runs against the old x.
     low = np.array([translate[2], translate[1], -translate[0] - scale])
     diagonal = float(np.linalg.norm(facts.high - facts.low))
     turned = cells.transpose(2, 1, 0)[:, :, ::-1]

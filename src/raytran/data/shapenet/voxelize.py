@@ -18,12 +18,12 @@ Cells = NDArray[np.bool_]
 Floats = NDArray[np.floating]
 Columns = tuple[NDArray[np.int64], NDArray[np.int64]]
 
-# Rays pass beside the cell centres by these fractions of a cell, so that they meet no edge or vertex exactly.
+# Rays miss the cell centres by these fractions of a cell, so that they hit no edge or vertex exactly.
 _SHIFT = (1.37e-4, 2.11e-4)
 _VOTES_NEEDED = 4
 
 _MAX_CELLS = 1 << 20
-"""Cells that the boxes of the triangles cut at once may meet, over all three axes."""
+"""Most cells that the boxes of the triangles of one block cover, over all three axes; limits the memory."""
 
 
 def voxelize_solid(vertices: ArrayLike, faces: ArrayLike, size: int = SHAPE_SIZE) -> Cells:
@@ -40,9 +40,9 @@ def voxelize_solid(vertices: ArrayLike, faces: ArrayLike, size: int = SHAPE_SIZE
     """
     points = np.asarray(vertices, dtype=np.float64)
     low, extent = points.min(axis=0), np.ptp(points, axis=0)
-    # A flat mesh has no extent along one axis: it then lies in the middle layer.
-    places = np.where(extent > 0, (points - low) / np.where(extent > 0, extent, 1.0), 0.5)
-    solid, surface = scan_convert(places * size, faces, size)
+    # A mesh that is flat along an axis lies in the middle layer of cells.
+    unit = np.where(extent > 0, (points - low) / np.where(extent > 0, extent, 1.0), 0.5)
+    solid, surface = scan_convert(unit * size, faces, size)
     return solid | surface
 
 
@@ -74,7 +74,7 @@ def scan_convert(points: Floats, faces: ArrayLike, size: int) -> tuple[Cells, Ce
 
 
 def _blocks(triangles: Floats, size: int) -> list[Floats]:
-    """Split triangles into runs that meet so few cells that cutting them takes little memory."""
+    """Split triangles into blocks that cover so few cells that cutting them takes little memory."""
     width = np.minimum(np.ptp(triangles, axis=1), size) + 1
     cells = (width * np.roll(width, 1, axis=1)).sum(axis=1)
     number = np.cumsum(cells) // _MAX_CELLS
@@ -124,9 +124,9 @@ def _row_spans(triangles: Floats, face: NDArray[np.int64], height: Floats) -> tu
         start, stop = triangles[face, i, :2], triangles[face, (i + 1) % 3, :2]
         crosses = (start[:, 1] <= height) != (stop[:, 1] <= height)
         run = np.where(crosses, stop[:, 1] - start[:, 1], 1.0)
-        place = start[:, 0] + (height - start[:, 1]) / run * (stop[:, 0] - start[:, 0])
-        begin = np.where(crosses, np.minimum(begin, place), begin)
-        end = np.where(crosses, np.maximum(end, place), end)
+        crossing = start[:, 0] + (height - start[:, 1]) / run * (stop[:, 0] - start[:, 0])
+        begin = np.where(crosses, np.minimum(begin, crossing), begin)
+        end = np.where(crosses, np.maximum(end, crossing), end)
     return begin, end
 
 
@@ -152,7 +152,7 @@ def _votes(crossings: NDArray[np.int32], axis: int) -> NDArray[np.int8]:
         crossings[i] += crossings[i - 1]
     winding, beyond = crossings[:-1], crossings[-1]
     votes = (winding != 0).astype(np.int8) + (winding != beyond)
-    # From (axis, axis + 1, axis + 2) to (x, y, z).
+    # From the order (axis, axis + 1, axis + 2) to (x, y, z).
     return votes.transpose([(i - axis) % 3 for i in range(3)])
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Freely licensed furniture turned into CAD models in the layout of ShapeNetCore v2."""
+"""Converts freely licensed furniture to CAD models in the layout of ShapeNetCore v2."""
 
 from raytran.rooms.sweethome3d.furniture import FurnitureReport, import_furniture
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sweet Home 3D's furniture libraries as CAD models in the layout of ShapeNetCore v2.
+"""Imports Sweet Home 3D's furniture libraries as CAD models in the layout of ShapeNetCore v2.
 
-``furniture.csv`` beside this file says which pieces are furniture of the nine classes, checked piece by piece
-in pictures, and which of them need another turn than their catalogue gives.
+``furniture.csv`` beside this file lists the pieces that are furniture of the nine classes, each checked in
+pictures, and the rotation that corrects the one in the catalogue where that is wrong.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ _FORMAT = "raytran.furniture/1"
 """Rises when the same library no longer gives the same models."""
 
 HELD_OUT = ("Blend Swap CC-BY", "Kator Legaz catalog")
-"""Libraries whose models, and whose makers' models elsewhere, are kept for rooms to validate on."""
+"""Libraries of which all models, and all models by the same makers, are held out for validation rooms."""
 
 _TABLE = Path(__file__).with_name("furniture.csv")
 
 
 @dataclass(frozen=True)
 class Listed:
-    """A row of ``furniture.csv``: what a piece is, and the turn about +Y its rotation lacks, degrees."""
+    """A row of ``furniture.csv``: what a piece is, and the correction of its rotation about +Y, degrees."""
 
     piece: str
     category: str
@@ -50,7 +50,7 @@ class Listed:
 
 @dataclass(frozen=True)
 class Credit:
-    """Whose work a model is: a row of ``credits.csv``."""
+    """A row of ``credits.csv``: who made a model, and under which licence."""
 
     model: str
     name: str
@@ -66,8 +66,8 @@ class FurnitureReport:
 
     Attributes:
         root: folder of the models.
-        credits: every model there is now.
-        made: how many of them this call wrote.
+        credits: of every model in the folder.
+        made: number of models that this call wrote.
         left_out: listed pieces that could not be used, with the reason.
     """
 
@@ -89,7 +89,7 @@ def read_table() -> dict[str, Listed]:
 def import_furniture(
     source: Path, output: Path, *, processes: int = 0, progress: bool = True
 ) -> FurnitureReport:
-    """Write the listed furniture of one or several ``.sh3f`` libraries, or finish what was begun.
+    """Write the listed furniture of one or several ``.sh3f`` libraries, or go on where a call was killed.
 
     Each model becomes ``output/<catid>/<id>/models/model_normalized.*``; its ``.json`` also holds ``unit``
     ("m": ``min`` and ``max`` are its real size), ``kind``, ``symmetry``, ``split`` (``train``, or ``val`` for
@@ -146,7 +146,11 @@ def _held_out_makers(paths: list[Path]) -> frozenset[str]:
 def _write_piece(
     output: Path, held_out: frozenset[str], job: tuple[Path, str, str]
 ) -> tuple[str, tuple[Credit, bool] | str]:
-    """Write a piece unless it is there; return its id with credit and whether it was new, or why not."""
+    """Write a piece unless it exists.
+
+    Returns:
+        its id, and either its credit with whether it was new, or why it cannot be used.
+    """
     path, library_name, piece_id = job
     listed = read_table()[piece_id]
     with FurnitureLibrary(path) as library:
@@ -174,7 +178,7 @@ def _write_piece(
 
 
 def _model_id(library: FurnitureLibrary, piece: Piece, listed: Listed) -> str:
-    """Name a model by what it is made from, so that one that is there need not be made to be known."""
+    """Return the id of a model, a digest of its inputs: whether it exists is known without making it."""
     facts = [_FORMAT, *asdict(listed).values(), *piece.size_m, *piece.rotation.ravel()]
     facts.append(library.checksum(piece.model))
     return hashlib.sha256("|".join(str(fact) for fact in facts).encode()).hexdigest()[:32]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A piece of a furniture library as one mesh in ShapeNet's frame, with one colour a material."""
+"""Reads a piece of a furniture library as one mesh in ShapeNet's frame, with one colour per material."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from PIL import Image
 from raytran.errors import DataError
 from raytran.rooms.sweethome3d.catalogue import FurnitureLibrary, Piece
 
-# It tells of every polygon that it cuts.
+# It logs every polygon that it triangulates.
 logging.getLogger("trimesh").setLevel(logging.WARNING)
 
 MOST_FACES = 100_000
-"""Models with more triangles are left out: a room of them would take minutes to draw."""
+"""Models with more triangles are left out: a room of them would take minutes to render."""
 
 _MOST_CORNERS = 6 * MOST_FACES
-"""Models whose text has more corners of faces are not parsed, which takes ten times their size in memory."""
+"""A model with more corners of faces is not parsed: that would take ten times its size in memory."""
 
 _LARGEST_TEXTURE = 64 * 10**6
 _GREY = np.full(3, 0.7)
@@ -48,7 +48,7 @@ class PieceMesh:
 
 
 def read_piece(library: FurnitureLibrary, piece: Piece, turn_deg: float = 0.0) -> PieceMesh:
-    """Read a piece as Sweet Home 3D shows it: turned upright and stretched to the catalogue's sizes.
+    """Read a piece as Sweet Home 3D shows it: rotated upright and stretched to the catalogue's sizes.
 
     Args:
         library: the open library.

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write a data set to disk, or check one."""
+"""The command ``prepare``: write a data set to disk, or check one."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +20,11 @@ from raytran.run.train.build import plain
 
 _log = logging.getLogger(__name__)
 
+DATASETS = ("rooms", "rooms-v1", "rooms-v1-furniture", "scan2cad", "cads")
+
 _COUNTS = ("num_train", "num_val", "num_test")
-_CHOSEN = ("seed", "frames", "image_size", "min_objects", "max_objects", "room_size")
-"""What can be chosen of free rooms only."""
+_FREE_ONLY = ("seed", "frames", "image_size", "min_objects", "max_objects", "room_size")
+"""Settings that dataset=rooms alone has; rooms-v1 fixes them."""
 
 _FIXED = "rooms-v1 is the same for everybody; dataset=rooms makes rooms of your choice"
 
@@ -40,28 +41,37 @@ def prepare(cfg: DictConfig) -> Any:
     """
     if cfg.check is not None:
         return check(cfg)
-    if cfg.dataset not in _DATASETS:
-        raise ConfigError(f"unknown dataset={cfg.dataset}: choose one of {', '.join(_DATASETS)}")
+    if cfg.dataset not in DATASETS:
+        raise ConfigError(f"unknown dataset={cfg.dataset}: choose one of {', '.join(DATASETS)}")
     if cfg.output is None:
         raise ConfigError("output= is missing: give the folder to write to")
-    return _DATASETS[cfg.dataset](plain(cfg), Path(cfg.output))
+    settings, output = plain(cfg), Path(cfg.output)
+    if cfg.dataset == "rooms":
+        return _prepare_rooms(settings, output)
+    if cfg.dataset == "rooms-v1":
+        return _prepare_rooms_v1(settings, output)
+    if cfg.dataset == "rooms-v1-furniture":
+        return _prepare_rooms_v1_furniture(settings, output)
+    if cfg.dataset == "scan2cad":
+        return _prepare_scan2cad(settings, output)
+    return _prepare_cads(settings, output)
 
 
-def _rooms(settings: dict[str, Any], output: Path) -> Any:
+def _prepare_rooms(settings: dict[str, Any], output: Path) -> Any:
     _refuse(settings, "num_test", because="dataset=rooms has no test rooms, dataset=rooms-v1 has")
-    settings = _with_the_presets(settings)
+    settings = _with_preset(settings)
     report = generate_rooms(
         output,
         cads=_path(settings["cads"]),
         processes=settings["processes"],
-        **{name: settings[name] for name in ("num_train", "num_val", *_CHOSEN)},
+        **{name: settings[name] for name in ("num_train", "num_val", *_FREE_ONLY)},
     )
     _log.info("rooms are in %s; train on them with data.root=%s", output.resolve(), output)
     return report
 
 
-def _rooms_v1(settings: dict[str, Any], output: Path) -> Any:
-    _refuse(settings, *_CHOSEN, because=_FIXED)
+def _prepare_rooms_v1(settings: dict[str, Any], output: Path) -> Any:
+    _refuse(settings, *_FREE_ONLY, because=_FIXED)
     _refuse(settings, "cads", because="given CAD models go with dataset=rooms-v1-furniture")
     report = generate_rooms_v1(output, processes=settings["processes"], **_given(settings, *_COUNTS))
     _log.info("%s\nthe rooms are in %s", report_on_rooms(report.root), report.root)
@@ -69,8 +79,8 @@ def _rooms_v1(settings: dict[str, Any], output: Path) -> Any:
     return report
 
 
-def _rooms_v1_furniture(settings: dict[str, Any], output: Path) -> Any:
-    _refuse(settings, *_CHOSEN, because=_FIXED)
+def _prepare_rooms_v1_furniture(settings: dict[str, Any], output: Path) -> Any:
+    _refuse(settings, *_FREE_ONLY, because=_FIXED)
     _refuse(settings, "num_train", "num_val", because="rooms-v1-furniture has test rooms only")
     if settings["cads"] is None:
         raise ConfigError("cads= is missing: give the folder that prepare dataset=cads wrote")
@@ -83,25 +93,10 @@ def _rooms_v1_furniture(settings: dict[str, Any], output: Path) -> Any:
     return report
 
 
-def _refuse(settings: dict[str, Any], *names: str, because: str) -> None:
-    given = _given(settings, *names)
-    if given:
-        raise ConfigError(f"leave out {', '.join(f'{name}=' for name in given)}: {because}")
-
-
-def _given(settings: dict[str, Any], *names: str) -> dict[str, Any]:
-    return {name: settings[name] for name in names if settings[name] is not None}
-
-
-def _with_the_presets(settings: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings with those of the preset's rooms where none was given."""
-    return settings | {name: value for name, value in settings["rooms"].items() if settings[name] is None}
-
-
-def _scan2cad(settings: dict[str, Any], output: Path) -> Any:
+def _prepare_scan2cad(settings: dict[str, Any], output: Path) -> Any:
     if settings["scannet"] is None:
         raise ConfigError("scannet= is missing: give the folder of ScanNet's scans")
-    height, width = _with_the_presets(settings)["image_size"]
+    height, width = _with_preset(settings)["image_size"]
     released = Released(
         scannet=Path(settings["scannet"]),
         shapenet=_path(settings["shapenet"]),
@@ -121,7 +116,7 @@ def _scan2cad(settings: dict[str, Any], output: Path) -> Any:
     return prepared
 
 
-def _cads(settings: dict[str, Any], output: Path) -> Any:
+def _prepare_cads(settings: dict[str, Any], output: Path) -> Any:
     if settings["source"] is None:
         raise ConfigError("source= is missing: give the folder of the furniture libraries (*.sh3f)")
     report = import_furniture(Path(settings["source"]), output, processes=settings["processes"])
@@ -129,15 +124,26 @@ def _cads(settings: dict[str, Any], output: Path) -> Any:
     return report
 
 
+def _refuse(settings: dict[str, Any], *names: str, because: str) -> None:
+    """Raise if one of these settings was given.
+
+    Raises:
+        ConfigError: one was.
+    """
+    given = _given(settings, *names)
+    if given:
+        raise ConfigError(f"leave out {', '.join(f'{name}=' for name in given)}: {because}")
+
+
+def _given(settings: dict[str, Any], *names: str) -> dict[str, Any]:
+    """Return those of the named settings that are not null."""
+    return {name: settings[name] for name in names if settings[name] is not None}
+
+
+def _with_preset(settings: dict[str, Any]) -> dict[str, Any]:
+    """Return the settings; those of rooms that are null are the preset's."""
+    return settings | {name: value for name, value in settings["rooms"].items() if settings[name] is None}
+
+
 def _path(value: str | None) -> Path | None:
     return None if value is None else Path(value)
-
-
-_DATASETS: dict[str, Callable[[dict[str, Any], Path], Any]] = {
-    "rooms": _rooms,
-    "rooms-v1": _rooms_v1,
-    "rooms-v1-furniture": _rooms_v1_furniture,
-    "scan2cad": _scan2cad,
-    "cads": _cads,
-}
-"""Name of a data set → what writes it."""
