@@ -167,7 +167,7 @@ def test_a_picture_is_the_backdrop_until_the_camera_leaves(nodes, scene):
     nodes.set_backdrop(2)
     there = scene.cameras.position[2].numpy()
     nodes.leave_backdrop(there + 1.0)  # a message from before the camera came
-    assert nodes.frames[2].scale == pytest.approx(60 * depth[2])
+    assert nodes.frames[2].scale == pytest.approx(15 / 0.16 * depth[2])
     assert nodes.frames[1].scale == depth[1]
     nodes.leave_backdrop(there)
     nodes.leave_backdrop(there + 0.1)
@@ -232,6 +232,6 @@ def test_an_export_is_coarser_smaller_and_tells_errors(server, tmp_path, monkeyp
             )
     assert list(export.frames) == [1, 3, 5]
     assert export.frames[1].image.shape == (240, 320, 3)
-    assert export.objects[0].name.text == "bathtub 0.95\n0 cm, 0°"
-    assert export.objects[1].name.text == "bookshelf 0.75\n30 cm, 0°, missed"
+    assert export.objects[0].name.text == "bathtub 0.95 ✓\n0 cm, 0°"
+    assert export.objects[1].name.text == "bookshelf 0.75 ✗\n30 cm, 0°"
     assert export.objects[0].name.font_size_mode == "scene"

@@ -38,6 +38,9 @@ from raytran.viewer.scene import (
 _REACH = 30.0
 """Metres along a click's ray in which something is looked for."""
 
+_PANEL_WIDTH = 480
+"""Pixels to which small frames are enlarged, about."""
+
 _LAYERS = ("meshes", "boxes", "names", "frames", "truth", "voxels", "grid")
 _COLORINGS: dict[str, Literal["probability", "views"]] = {
     "how likely it is occupied": "probability",
@@ -340,8 +343,10 @@ def first_hit(
 
 
 def draw_boxes(image: Pixels, camera: Cameras, objects: ObjectSet) -> Pixels:
-    """Return a camera's picture with boxes over it, those of the front bold."""
+    """Return a camera's picture, large enough to look at, with boxes over it, those of the front bold."""
     picture = Image.fromarray(image)
+    enlarged = max(1, round(_PANEL_WIDTH / picture.width))
+    picture = picture.resize((picture.width * enlarged, picture.height * enlarged), Image.Resampling.NEAREST)
     pen = ImageDraw.Draw(picture)
     scaled = camera.scaled_to((picture.height, picture.width))
     for label, segments in zip(objects.label.tolist(), box_segments(objects, scaled), strict=True):

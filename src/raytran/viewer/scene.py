@@ -28,7 +28,7 @@ FIELD_OF_VIEW = 0.87
 Floats = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
 
-_FRUSTUM_DEPTH = 0.25
+_FRUSTUM_DEPTH = 0.16
 _BACKDROP_DEPTH = 15.0
 _AWAY = 0.02  # metres from which on a camera has left a frame's place
 _MARKED = (255, 176, 0)
@@ -269,13 +269,13 @@ class SceneNodes:
     def _add_name(self, path: str, index: int) -> viser.LabelHandle:
         text, error = self.names[index], self._scene.errors[index]
         if self._export and error is not None:
-            text += f"\n{describe_error(error)}"
+            text += describe_error(error)
         return self._server.scene.add_label(
             path,
             text,
             position=self.name_points[index],
             font_size_mode="scene" if self._export else "screen",
-            font_scene_height=0.1,
+            font_scene_height=0.09,
             anchor="bottom-center",
         )
 
@@ -350,9 +350,8 @@ def object_name(scene: ViewerScene, index: int) -> str:
 
 
 def describe_error(error: ObjectError) -> str:
-    """Return an error in a few words, in centimetres and degrees."""
-    found = "" if error.found else ", missed"
-    return f"{100 * error.translation:.0f} cm, {error.rotation:.0f}°{found}"
+    """Return whether an object is found and how far it is off, in a few words for the end of its name."""
+    return f"{' ✓' if error.found else ' ✗'}\n{100 * error.translation:.0f} cm, {error.rotation:.0f}°"
 
 
 def home(scene: ViewerScene) -> tuple[Floats, Floats]:
@@ -451,13 +450,14 @@ def _coarser(meshes: Sequence[trimesh.Trimesh | None]) -> list[trimesh.Trimesh |
 
 def _clustered(mesh: trimesh.Trimesh, cell: float) -> trimesh.Trimesh:
     """Return a mesh whose vertices in one cell (metres) are their mean, without the faces that vanish."""
-    keys = np.floor(np.asarray(mesh.vertices) / cell).astype(np.int64)
-    _, cluster, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-    cluster = cluster.reshape(-1)
-    vertices = np.stack([np.bincount(cluster, axis) for axis in np.asarray(mesh.vertices).T], axis=1)
+    vertices = np.asarray(mesh.vertices)
+    index = np.floor((vertices - vertices.min(axis=0)) / cell).astype(np.int64)
+    # One number a cell, and below one a face: sorting numbers takes a tenth of the time of sorting rows.
+    cells = np.ravel_multi_index(tuple(index.T), tuple(index.max(axis=0) + 1))
+    _, cluster, count = np.unique(cells, return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(cluster, axis) for axis in vertices.T], axis=1) / count[:, None]
     faces = cluster[np.asarray(mesh.faces)]
-    corners = np.sort(faces, axis=1)
-    whole = (corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2])
-    # Several faces may have become one.
-    _, first = np.unique(corners[whole], axis=0, return_index=True)
-    return trimesh.Trimesh(vertices / count[:, None], faces[whole][first], process=False)
+    a, b, c = np.sort(faces, axis=1).T
+    whole = (a != b) & (b != c)
+    _, first = np.unique(((a * len(means) + b) * len(means) + c)[whole], return_index=True)
+    return trimesh.Trimesh(means, faces[whole][first], process=False)
