@@ -16,8 +16,8 @@ from torch import nn
 
 from raytran.checkpoints.load import PredictionSettings
 from raytran.errors import CheckpointError, ConfigError, DataError
-from raytran.run.predict import files
 from raytran.run.predict import predict as module
+from raytran.run.predict import write_scene
 from raytran.structs import ObjectSet, ScenePrediction, Views
 from raytran.viewer import has_viser
 from raytran.viewer.data import read_viewer_scene
@@ -195,7 +195,7 @@ def test_the_viewer_gets_frames_voxels_and_errors(scene, oracle, tmp_path):
 
 def test_without_viser_there_is_no_page_and_that_is_said_once(scene, oracle, tmp_path, monkeypatch, caplog):
     caplog.set_level("INFO")
-    for place in (module, files):
+    for place in (module, write_scene):
         monkeypatch.setattr(place, "has_viser", lambda: False)
     output = module.predict(config(scene, tmp_path / "out"))
     assert (output / "viewer.npz").is_file()
