@@ -37,7 +37,7 @@ from raytran.ops.splat import splat_features
 from raytran.ops.traverse import count_views, trace_pairs
 from raytran.postprocess import count_object_views, merge_volumes, object_meshes, select_objects
 from raytran.structs import ObjectSet, ScenePrediction
-from raytran.viewer.attention_weights import attention_weights
+from raytran.viewer.attention import attention_weights
 
 from .pretend_device import DEVICE, on_pretend_device, recorded
 

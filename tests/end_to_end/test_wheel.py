@@ -82,13 +82,6 @@ def test_the_page_templates_are_inside(name: str, site: Path) -> None:
     assert (site / "raytran" / "view" / "templates" / name).is_file()
 
 
-def test_the_viewers_page_is_inside(site: Path, project_root: Path) -> None:
-    page = Path("raytran") / "view" / "viewer" / "page"
-    expected = {path.relative_to(project_root / "src") for path in (project_root / "src" / page).rglob("*.*")}
-    assert page / "vendor" / "three.js.gz" in expected
-    assert {path.relative_to(site) for path in (site / page).rglob("*.*")} == expected
-
-
 def test_the_folder_of_weights_is_inside(site: Path, project_root: Path) -> None:
     folder = project_root / "src" / "raytran" / "weights"
     expected = {path.name for path in folder.iterdir()}

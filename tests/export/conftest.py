@@ -3,13 +3,8 @@
 
 from __future__ import annotations
 
-import json
 import math
-import shutil
-import subprocess
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -59,21 +54,3 @@ def cameras() -> Cameras:
     pose[:, :3, 3] = torch.tensor([[0.0, -3, 1.5], [0.25, -3, 1.5]])
     intrinsics = torch.tensor([[100.0, 0, 80], [0, 120, 60], [0, 0, 1]]).expand(2, 3, 3)
     return Cameras(intrinsics, pose, (120, 160))
-
-
-@pytest.fixture
-def read_three() -> Callable[[Path], dict[str, Any]]:
-    """What three.js finds in a file; needs Node.js and three (npm), found from here or by NODE_PATH."""
-    node = shutil.which("node")
-    if node is None:
-        pytest.skip("node is not installed")
-    script = Path(__file__).with_name("read_three.mjs")
-
-    def read(path: Path) -> dict[str, Any]:
-        run = subprocess.run([node, script, path], capture_output=True, text=True, timeout=120, check=False)
-        if "Cannot find module 'three" in run.stderr:
-            pytest.skip("three is not installed: npm install three")
-        assert run.returncode == 0, run.stderr
-        return json.loads(run.stdout)
-
-    return read

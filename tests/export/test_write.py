@@ -136,15 +136,6 @@ def test_names(prediction):
     assert [object_name(prediction.objects, i) for i in range(2)] == ["00_chair", "01_table"]
 
 
-def test_three_js_reads_the_obj(tmp_path, prediction, box_at, read_three):
-    write_meshes(tmp_path, prediction.objects, [None, box_at([1, 2, 0.5])])
-    found = read_three(tmp_path / "meshes" / "01.obj")
-    assert list(found) == ["01_table"]
-    assert np.allclose(found["01_table"]["low"], [0.75, 1.7, 0.0])
-    assert np.allclose(found["01_table"]["high"], [1.25, 2.3, 1.0])
-    assert found["01_table"]["color"] == "2ca02c"
-
-
 def test_points_lie_where_the_voxels_are(tmp_path):
     occupancy = torch.full((4, 4, 2), 0.5)
     occupancy[1, 2, 0], occupancy[0, 0, 1] = 0.75, 1.0

@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A result folder as predict writes it, and a server that shows it."""
+"""A result folder as predict writes it."""
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -16,12 +14,10 @@ from raytran.export import write_prediction
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.ops.traverse import trace_pairs
+from raytran.ops.traverse import count_views, trace_pairs
 from raytran.structs import ObjectSet, ScenePrediction, Views
-from raytran.viewer.scenes import find_scenes
-from raytran.viewer.server import Viewer
-from raytran.viewer.view_data import ViewedVolume, write_view_data
-from raytran.viewer.view_reads import VoxelReads
+from raytran.viewer.attention import VoxelReads, pack_reads
+from raytran.viewer.data import VoxelVolume, write_viewer_data
 
 EXTENT = (8.0, 8.0, 3.0)
 
@@ -74,7 +70,7 @@ def make_reads(views: Views, frames: Sequence[int], grid: VoxelGrid) -> VoxelRea
     pairs = trace_pairs(cameras, grid, (size[0] // 16, size[1] // 16))
     counts = pairs.pixels_per_voxel()
     weight = torch.repeat_interleave(1 / counts[counts > 0], counts[counts > 0])
-    return VoxelReads(pairs, weight, (size[0] // 16, size[1] // 16))
+    return pack_reads(weight, pairs, (size[0] // 16, size[1] // 16))
 
 
 def write_result(
@@ -84,7 +80,7 @@ def write_result(
     num_frames: int = 5,
     size: tuple[int, int] = (48, 64),
     subdivisions: int = 2,
-    with_view: bool = True,
+    with_viewer: bool = True,
     in_parts: bool = False,
 ) -> Path:
     """Write a scene of which the truth is known: object 0 is as predicted, the others stand 30 cm beside.
@@ -98,43 +94,26 @@ def write_result(
     centers = grid.voxel_centers()
     prediction = ScenePrediction(folder.name, objects, grid.center)
     write_prediction(folder, prediction, [make_mesh(objects, n, subdivisions) for n in range(num_objects)])
-    if with_view:
-        volume = ViewedVolume(
+    if with_viewer:
+        volume = VoxelVolume(
             grid=grid,
             frames=range(num_frames),
-            occupancy=(centers[..., 2] < 0.6) & (centers[..., :2].norm(dim=-1) < 3) & (centers[..., 0] > 0),
-            seen=make_reads(views, range(num_frames), grid).pairs.pixels_per_voxel().view(resolution),
+            occupancy=0.9
+            * ((centers[..., 2] < 0.6) & (centers[..., :2].norm(dim=-1) < 3) & (centers[..., 0] > 0)),
+            view_count=count_views(Cameras(views.intrinsics[0], views.world_from_camera[0], size), grid),
             reads=None if in_parts else make_reads(views, range(num_frames), grid),
         )
         volumes = [volume]
         for frames, x in [(range(num_frames // 2), -1.0), (range(num_frames // 2, num_frames), 1.0)]:
             part = VoxelGrid(resolution, EXTENT, torch.tensor([x, 0.0, 1.0]))
-            volumes += [ViewedVolume(part, frames, reads=make_reads(views, frames, part))] if in_parts else []
+            volumes += [VoxelVolume(part, frames, reads=make_reads(views, frames, part))] if in_parts else []
         truth = make_objects(num_objects)
         truth.center[1:, 1] += 0.3
         names = [f"{10 * n:06d}" for n in range(num_frames)]
-        write_view_data(folder, prediction, views, names, volumes=volumes, truth=truth)
+        write_viewer_data(folder, views, names, volumes=volumes, truth=truth)
     return folder
 
 
 @pytest.fixture(scope="session")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_result(tmp_path_factory.mktemp("viewer") / "results" / "room")
-
-
-@pytest.fixture(scope="session")
-def serve() -> Callable[..., object]:
-    """Serve a folder while a block runs."""
-
-    @contextmanager
-    def serving(folder: Path, **settings: object):
-        with Viewer(find_scenes(folder), **{"port": 0, **settings}) as server:
-            thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.02})
-            thread.start()
-            try:
-                yield server
-            finally:
-                server.shutdown()
-                thread.join()
-
-    return serving

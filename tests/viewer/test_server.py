@@ -1,137 +1,66 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-import http.client
-import json
+import re
 import socket
 import urllib.request
 
 import pytest
 
-from raytran.errors import ConfigError
-from raytran.viewer import server as module
-from raytran.viewer.scenes import find_scenes
-from raytran.viewer.server import Viewer
+import raytran.viewer
+from raytran.errors import ConfigError, DataError
+
+from .conftest import write_result
+
+pytest.importorskip("viser", reason="needs viser (pip install 'raytran[viewer]')")
+from raytran.viewer.server import free_port, quiet_server, write_html
 
 
-@pytest.fixture(scope="module")
-def served(result, serve):
-    (result.parent / "outside.txt").write_text("outside")
-    with serve(result) as server:
-        yield server
+def test_one_file_holds_the_scene_and_the_program_that_shows_it(tmp_path):
+    folder = write_result(tmp_path / "room", size=(480, 640))
+    other = write_result(tmp_path / "other", num_objects=1, with_viewer=False)
+    path, small = write_html(folder), write_html(other)
+    page = path.read_text()
+    assert path == folder / "prediction.html"
+    assert 700_000 < path.stat().st_size < 1_500_000
+    (data,) = re.findall(r'__VISER_EMBED_DATA__="([A-Za-z0-9+/=]+)"', page)
+    assert len(data) > path.stat().st_size - small.stat().st_size > 10_000
+    # Nothing is loaded from elsewhere; the address of SVG's namespace is a name.
+    assert set(re.findall(r"https?://[\w./-]+", page)) <= {"http://www.w3.org/2000/svg"}
+    assert not re.findall(r'(?:src|href)="(?!data:)', page)
 
 
-def ask(server, path, method="GET", **headers):
-    """Send exactly this path, as no browser would."""
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=5)
-    connection.putrequest(method, path, skip_host="Host" in headers)
-    for name, value in headers.items():
-        connection.putheader(name, value)
-    connection.endheaders()
-    response = connection.getresponse()
-    content = response.read()
-    connection.close()
-    return response, content
+def test_a_server_is_quiet_and_gives_the_page(capfd):
+    with (
+        quiet_server() as server,
+        urllib.request.urlopen(f"http://127.0.0.1:{server.get_port()}/", timeout=10) as answer,
+    ):
+        assert b"<title>Viser</title>" in answer.read()
+    said = capfd.readouterr()
+    assert said.out + said.err == ""
 
 
-def test_the_page_and_its_scene(served, result):
-    page, content = ask(served, "/")
-    assert page.status == 200
-    assert page.getheader("Content-Type") == "text/html; charset=utf-8"
-    assert b"<canvas" in content
-    assert json.loads(ask(served, "/scenes.json")[1]) == ["room"]
-    for name in ("scene.json", "scene.glb", "view/view.json", "view/frames/0000.jpg"):
-        assert ask(served, f"/scenes/0/{name}")[1] == (result / name).read_bytes(), name
-    assert ask(served, "/scenes/0/view/frames/0000.jpg?again")[0].getheader("Content-Type") == "image/jpeg"
-    packed, _ = ask(served, "/vendor/three.js")
-    assert packed.getheader("Content-Encoding") == "gzip"
-    assert packed.getheader("Content-Type") == "text/javascript; charset=utf-8"
+def test_a_port_that_is_taken(monkeypatch):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(ConfigError, match=rf"cannot listen on host=127\.0\.0\.1, port={port} \("):
+            free_port("127.0.0.1", port)
+        monkeypatch.setattr("raytran.viewer.server.FIRST_PORT", port)
+        assert port < free_port("127.0.0.1", None) < port + 20
+    assert free_port("127.0.0.1", 0) > 0
+    with pytest.raises(ConfigError, match=r"cannot listen on host=no\.such\.host\.example, port=0"):
+        free_port("no.such.host.example", 0)
 
 
-def test_a_page_may_load_from_here_alone(served):
-    for path in ("/", "/scenes/0/scene.json", "/nothing"):
-        policy = ask(served, path)[0].getheader("Content-Security-Policy")
-        assert policy.startswith("default-src 'self';")
-        assert "http" not in policy
-
-
-@pytest.mark.parametrize(
-    "path",
-    [
-        *("/outside.txt", "/../outside.txt", "/scenes/0/../../outside.txt", "/scenes/0/%2e%2e/outside.txt"),
-        *(
-            "/scenes/0/view/..%2f..%2foutside.txt",
-            "/scenes/0/view/%5c..%5coutside.txt",
-            "/scenes/0//etc/passwd",
-        ),
-        *(
-            "//etc/passwd",
-            "/%2fetc%2fpasswd",
-            "/scenes/0/view/%00",
-            "/scenes/1/scene.json",
-            "/scenes/-1/scene.json",
-        ),
-        *("/scenes/0/meshes/00.ply", "/scenes/", "/scenes/0", "/scenes/%D9%A0/scene.json"),
-        *(
-            "/scenes/99999999999999999999/scene.json",
-            "/server.py",
-            "/../server.py",
-            "/vendor/three.js.gz",
-            "//[zz",
-        ),
-    ],
-)
-def test_nothing_else_is_given_away(served, path):
-    response, content = ask(served, path)
-    assert response.status == 404
-    assert content == b""
-
-
-def test_it_only_reads(served, result):
-    before = (result / "scene.json").read_bytes()
-    for method in ("POST", "PUT", "DELETE", "OPTIONS"):
-        assert ask(served, "/scenes/0/scene.json", method)[0].status == 501
-    head, content = ask(served, "/scenes/0/scene.json", "HEAD")
-    assert (head.status, int(head.getheader("Content-Length")), content) == (200, len(before), b"")
-    assert (result / "scene.json").read_bytes() == before
-
-
-def test_only_names_of_this_machine_are_answered(served):
-    for host in ("127.0.0.1", "localhost:80", "[::1]:9"):
-        assert ask(served, "/", Host=host)[0].status == 200, host
-    for host in ("elsewhere.example", "127.0.0.1.example", "", "10.0.0.1", "[zz]"):
-        assert ask(served, "/", Host=host)[0].status == 403, host
-
-
-def test_who_listens_to_all_is_asked_by_any_name(result, serve):
-    with serve(result, host="0.0.0.0") as server:
-        assert not server.only_local
-        assert ask(server, "/", Host="elsewhere.example")[0].status == 200
-
-
-def test_it_listens_to_this_machine_alone(served):
-    assert served.server_address[0] == "127.0.0.1"
-    assert served.only_local
-    assert served.url == f"http://127.0.0.1:{served.server_port}/"
-
-
-@pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="this machine has no IPv6")
-def test_it_listens_to_this_machine_by_its_newer_address(result, serve):
-    with serve(result, host="::1") as server:
-        assert server.only_local
-        assert server.url == f"http://[::1]:{server.server_port}/"
-        with urllib.request.urlopen(server.url) as answer:
-            assert answer.status == 200
-
-
-def test_ports(result, monkeypatch):
-    scenes = find_scenes(result)
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        number = taken.getsockname()[1]
-        with pytest.raises(ConfigError, match=rf"port={number} .*choose another port="):
-            Viewer(scenes, port=number)
-        monkeypatch.setattr(module, "FIRST_PORT", number)
-        with Viewer(scenes) as server:
-            assert number < server.server_port < number + 20
-    with pytest.raises(ConfigError, match=r"host=256\.1\.1\.1"):
-        Viewer(scenes, host="256.1.1.1", port=0)
+def test_show_is_for_notebooks(result, monkeypatch, tmp_path):
+    heights = []
+    monkeypatch.setattr("viser.SceneApi.show", lambda _, height: heights.append(height))
+    raytran.viewer.show(result, height=333)
+    assert heights == [333]
+    with pytest.raises(DataError, match="no scene file"):
+        raytran.viewer.show(tmp_path)
+    monkeypatch.setattr(raytran.viewer, "has_viser", lambda: False)
+    with pytest.raises(ConfigError, match=r"not installed: pip install 'raytran\[viewer\]'"):
+        raytran.viewer.show(result)

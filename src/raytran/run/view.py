@@ -3,17 +3,18 @@
 
 from __future__ import annotations
 
+import ipaddress
 import logging
 import os
 import sys
+import time
 import webbrowser
 from pathlib import Path
 
 from omegaconf import DictConfig
 
 from raytran.errors import ConfigError
-from raytran.viewer.scenes import find_scenes
-from raytran.viewer.server import Viewer
+from raytran.viewer import MISSING, has_viser
 
 _log = logging.getLogger(__name__)
 
@@ -22,19 +23,28 @@ def view(cfg: DictConfig) -> None:
     """Run ``python -m raytran.view`` until it is interrupted; see ``conf/view.yaml``.
 
     Raises:
-        DataError: there is no result to show.
-        ConfigError: it cannot listen on the address wanted.
+        DataError: there is no result to show, or it is damaged.
+        ConfigError: viser is not installed, or it cannot listen on the address wanted.
     """
-    scenes = find_scenes(Path(cfg.folder))
-    with Viewer(scenes, host=str(cfg.host), port=_port(cfg.port)) as server:
+    if not has_viser():
+        raise ConfigError(MISSING)
+    from raytran.viewer.app import ViewerApp
+    from raytran.viewer.data import find_scenes
+    from raytran.viewer.server import free_port, quiet_server
+
+    scenes, host = find_scenes(Path(cfg.folder)), str(cfg.host)
+    with quiet_server(host, free_port(host, _port(cfg.port))) as server:
+        ViewerApp(server, scenes)
         count = "1 scene" if len(scenes) == 1 else f"{len(scenes)} scenes"
-        _log.info("%s of %s at %s (Ctrl-C ends it)", count, Path(cfg.folder).resolve(), server.url)
-        if not server.only_local:
-            _log.warning("host=%s: whoever reaches this machine can look at these scenes", cfg.host)
+        url = f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}/"
+        _log.info("%s of %s at %s (Ctrl-C ends it)", count, Path(cfg.folder).resolve(), url)
+        if not _is_local(host):
+            _log.warning("host=%s: whoever reaches this machine can look at these scenes", host)
         if cfg.open and _has_screen():
-            webbrowser.open(server.url)
+            webbrowser.open(url)
         try:
-            server.serve_forever()
+            while True:
+                time.sleep(3600)
         except KeyboardInterrupt:
             _log.info("ended")
 
@@ -45,6 +55,13 @@ def _port(value: object) -> int | None:
     if isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**16:
         return value
     raise ConfigError(f"port={value} is no port: give a number from 0 to 65535, or auto")
+
+
+def _is_local(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
 
 
 def _has_screen() -> bool:

@@ -17,7 +17,10 @@ from torch import nn
 from raytran.checkpoints.load import PredictionSettings
 from raytran.errors import CheckpointError, ConfigError, DataError
 from raytran.run.predict import predict as module
+from raytran.run.predict import write_scene
 from raytran.structs import ObjectSet, ScenePrediction, Views
+from raytran.viewer import has_viser
+from raytran.viewer.data import read_viewer_scene
 
 from ...scan_forms import encode_sens, write_form
 
@@ -138,7 +141,8 @@ def test_all_files_are_written(scene, oracle, tmp_path):
         "meshes",
         "topdown.png",
         "overlays",
-        "view",
+        "viewer.npz",
+        *(["prediction.html"] if has_viser() else []),
     }
     assert len(list((output / "overlays").iterdir())) == 2
     assert [path.name for path in output.parent.iterdir()] == ["room"]
@@ -176,16 +180,27 @@ def test_the_viewer_gets_frames_voxels_and_errors(scene, oracle, tmp_path):
     chair["rotation"] = UPRIGHT.tolist()
     truth.write_text(json.dumps({"format": "raytran.scene/1", "scene_id": "any", "objects": [chair]}))
     output = module.predict(config(scene, tmp_path / "out", truth=str(truth)))
-    content = json.loads((output / "view" / "view.json").read_text())
-    assert [frame["name"] for frame in content["frames"]] == ["0", "5", "15", "20"]
-    assert content["volumes"][0]["resolution"] == [4, 4, 2]
-    assert content["errors"][0]["found"]
-    assert content["errors"][0]["translation_m"] == pytest.approx(0.1, abs=1e-6)
+    shown = read_viewer_scene(output)
+    assert shown.frame_ids == ["0", "5", "15", "20"]
+    assert shown.occupancy.shape == (4, 4, 2)
+    assert shown.errors[0].found
+    assert shown.errors[0].translation == pytest.approx(0.1, abs=1e-6)
+    assert len(shown.meshes[0].faces) > 100
     output = module.predict(config(scene, tmp_path / "out", viewer=False))
-    assert not (output / "view").exists()
+    assert not {path.name for path in output.iterdir()} & {"viewer.npz", "prediction.html"}
     with pytest.raises(DataError, match=r"cannot read truth=.*nothing\.json"):
         module.predict(config(scene, tmp_path / "none", truth=str(tmp_path / "nothing.json")))
     assert not (tmp_path / "none").exists()
+
+
+def test_without_viser_there_is_no_page_and_that_is_said_once(scene, oracle, tmp_path, monkeypatch, caplog):
+    caplog.set_level("INFO")
+    for place in (module, write_scene):
+        monkeypatch.setattr(place, "has_viser", lambda: False)
+    output = module.predict(config(scene, tmp_path / "out"))
+    assert (output / "viewer.npz").is_file()
+    assert not (output / "prediction.html").exists()
+    assert caplog.text.count("pip install 'raytran[viewer]'") == 1
 
 
 def test_views_follow_the_checkpoint_and_come_once(scene, oracle, tmp_path):

@@ -26,7 +26,9 @@ from raytran.run.predict.new_views import cameras_to_render, render_views
 from raytran.run.predict.room import RoomViews, check_choice, read_room
 from raytran.run.predict.write_scene import MARKER, PredictedScene, check_pictures, write_scene
 from raytran.structs import ScenePrediction
-from raytran.viewer.viewed import read_truth, viewed_volumes
+from raytran.viewer import has_viser
+from raytran.viewer.data import predicted_volumes
+from raytran.viewer.truth import read_truth
 
 _LOG = logging.getLogger(__name__)
 
@@ -147,7 +149,7 @@ def predict_scene(
         several = len(room.volumes) > 1
         parts = tuple(zip(room.volumes.center, room.members, strict=True)) if several else ()
         extent = room.volumes.joint().extent
-        volumes = viewed_volumes(model, room.views, prediction, observed, grid_extent=extent, parts=parts)
+        volumes = predicted_volumes(model, room.views, prediction, observed, grid_extent=extent, parts=parts)
     return PredictedScene(prediction, object_meshes(prediction), volumes=volumes)
 
 
@@ -223,5 +225,7 @@ def _report(output: Path, scene: PredictedScene) -> None:
             scene.prediction.scene_id,
         )
     _LOG.info("wrote %s: %s", output.resolve(), ", ".join(sorted(path.name for path in output.iterdir())))
-    if scene.volumes is not None:
+    if scene.volumes is not None and has_viser():
         _LOG.info("look at it: python -m raytran.view %s", shlex.quote(str(output)))
+    elif scene.volumes is not None:
+        _LOG.info("no prediction.html to look at it: pip install 'raytran[viewer]'")

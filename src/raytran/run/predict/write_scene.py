@@ -20,7 +20,8 @@ from raytran.pictures.topdown import draw_topdown
 from raytran.pictures.turntable import draw_turntable
 from raytran.run.output import replaced_folder
 from raytran.structs import ObjectSet, ScenePrediction, Views
-from raytran.viewer.view_data import ViewedVolume, write_view_data
+from raytran.viewer import has_viser
+from raytran.viewer.data import VoxelVolume, write_viewer_data
 
 MARKER = "scene.json"
 """The file that tells a finished result."""
@@ -40,7 +41,7 @@ class PredictedScene:
     prediction: ScenePrediction
     meshes: Sequence[trimesh.Trimesh | None]
     cads: NearestCads | None = None
-    volumes: Sequence[ViewedVolume] | None = None
+    volumes: Sequence[VoxelVolume] | None = None
 
     def with_cads(self, root: Path) -> PredictedScene:
         """Return the scene with the CAD models of a library that its objects are most like.
@@ -108,7 +109,12 @@ def write_scene(
             write_alignments_csv(folder / ALIGNMENTS, scene.cads.alignments())
             write_glb(folder / "cads.glb", prediction.objects, scene.cads.meshes())
         if scene.volumes is not None:
-            write_view_data(folder, prediction, views, frame_ids, volumes=scene.volumes, truth=truth)
+            write_viewer_data(folder, views, frame_ids, volumes=scene.volumes, truth=truth)
         write_prediction(
             folder, prediction, scene.meshes, cameras=cameras, frame_ids=frame_ids, grid_extent=grid_extent
         )
+        if scene.volumes is not None and has_viser():
+            # Here, since the package that draws is an extra.
+            from raytran.viewer.server import write_html
+
+            write_html(folder)

@@ -1,0 +1,375 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``viewer.npz``: what the viewer shows of a prediction besides its objects and meshes.
+
+One file of plain arrays, read without pickle: small JPEGs of the frames with their cameras; for each voxel
+volume what is occupied, how many views saw it and which pixels it read; the true objects if they are known.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+from PIL import Image
+from torch import Tensor
+
+from raytran.errors import DataError
+from raytran.export import read_scene_json
+from raytran.geometry.camera import Cameras
+from raytran.geometry.grid import VoxelGrid
+from raytran.ops.traverse import trace_pairs
+from raytran.pictures.overlay import frame_image
+from raytran.structs import ObjectSet, ScenePrediction, Views
+from raytran.viewer.attention import ReadPixels, VoxelReads, attention_weights, pack_reads
+from raytran.viewer.truth import ObjectError, object_errors
+
+if TYPE_CHECKING:
+    # Not to read a result: the network alone takes seconds to import.
+    from raytran.backbone.observed import ObservedAttention
+    from raytran.model import RayTran
+
+FILE = "viewer.npz"
+FORMAT = "raytran.viewer/1"
+"""Value of ``format``; the number rises when a reader of the old form could misread the new one."""
+
+SCENE = "scene.json"
+MAX_SCENES = 1000
+"""Scenes to choose from; of more, the first by name."""
+
+_DEPTH = 3
+"""Folders below the one given that are searched."""
+
+_TRUTH = ("label", "center", "size", "rotation", "symmetry", "score")
+"""What is stored of the true objects, in the order of ``ObjectSet``."""
+
+_LONGEST_SIDE = 480
+_QUALITY = 80
+
+
+@dataclass(frozen=True)
+class VoxelVolume:
+    """One voxel volume that was predicted.
+
+    Attributes:
+        grid: of one scene, ``center`` ``(3,)``.
+        frames: which of the scene's frames it was predicted from.
+        occupancy: ``(X, Y, Z)`` probability, or None.
+        view_count: ``(X, Y, Z)`` int, how many views have a ray through each voxel; or None.
+        reads: which pixels each voxel read, of the views in ``frames``; or None.
+    """
+
+    grid: VoxelGrid
+    frames: Sequence[int]
+    occupancy: Tensor | None = None
+    view_count: Tensor | None = None
+    reads: VoxelReads | None = None
+
+    def voxel_at(self, point: NDArray[np.float64]) -> tuple[int, int, int] | None:
+        """Return the indices of the voxel at a point ``(3,)`` in the world, None outside."""
+        x, y, z = self.grid.voxel_from_world(torch.as_tensor(point)[None])[0].floor().long().tolist()
+        inside = all(0 <= i < n for i, n in zip((x, y, z), self.grid.resolution, strict=True))
+        return (x, y, z) if inside else None
+
+    def pixels_of(self, voxel: tuple[int, int, int]) -> ReadPixels | None:
+        """Return what a voxel read, the views numbered as the scene's frames; None if it is not known."""
+        if self.reads is None:
+            return None
+        pixels = self.reads.of_voxel(int(self.grid.flat_index(torch.tensor(voxel))))
+        return pixels._replace(view=np.asarray(self.frames, dtype=np.int64)[pixels.view])
+
+
+@dataclass(frozen=True)
+class ViewerScene:
+    """A result as the viewer shows it.
+
+    Attributes:
+        scene_id: name.
+        objects: the ``M`` predicted objects, surest first.
+        meshes: of each object, in the world; None: empty shape.
+        frame_ids: name of each of the ``N`` frames.
+        images: of each frame, ``(rows, columns, 3)`` uint8, smaller than the camera's image size.
+        cameras: ``(N,)``.
+        volumes: the first is the whole one; if there are more, these know what their voxels read.
+        truth: the true objects, or None if they are not known.
+        errors: of each object where the truth is known, see ``object_errors``.
+    """
+
+    scene_id: str
+    objects: ObjectSet
+    meshes: Sequence[trimesh.Trimesh | None]
+    frame_ids: Sequence[str]
+    images: Sequence[NDArray[np.uint8]]
+    cameras: Cameras
+    volumes: Sequence[VoxelVolume]
+    truth: ObjectSet | None
+    errors: Sequence[ObjectError | None]
+
+    def camera(self, frame: int) -> Cameras:
+        """Return the camera of one frame, no leading dimensions."""
+        cameras = self.cameras
+        return Cameras(cameras.intrinsics[frame], cameras.world_from_camera[frame], cameras.image_size)
+
+    @property
+    def occupancy(self) -> Tensor | None:
+        """``(X, Y, Z)`` probability in the first volume, or None."""
+        return self.volumes[0].occupancy if self.volumes else None
+
+    def volume_at(self, point: NDArray[np.float64]) -> VoxelVolume | None:
+        """Return the volume whose voxel at a point to show: the nearest of those that know what it read."""
+        there = [volume for volume in self.volumes if volume.voxel_at(point) is not None]
+        knowing = [volume for volume in there if volume.reads is not None] or there
+
+        def distance(volume: VoxelVolume) -> float:
+            offset = (torch.as_tensor(point) - volume.grid.center) / torch.tensor(volume.grid.extent)
+            return float(offset.norm())
+
+        return min(knowing, key=distance, default=None)
+
+
+def predicted_volumes(
+    model: RayTran,
+    views: Views,
+    prediction: ScenePrediction,
+    observed: ObservedAttention | None,
+    *,
+    grid_extent: tuple[float, float, float],
+    parts: Sequence[tuple[Tensor, Sequence[int]]] = (),
+) -> list[VoxelVolume]:
+    """Return the voxels of a prediction, and from which pixels the last block gathered what they hold.
+
+    Args:
+        model: the network that ran.
+        views: B = 1, all frames.
+        prediction: its result, on the CPU.
+        observed: what was recorded while it ran (``observe_attention``), or None.
+        grid_extent: sizes of the prediction's voxel grid, metres.
+        parts: centre ``(3,)`` and frames of each run of the network, if it was not one on all frames.
+
+    Returns:
+        the prediction's grid, and if there are several parts each of these with what it read; none if the
+        prediction has no voxels.
+    """
+    if prediction.occupancy is None:
+        return []
+    x, y, z = prediction.occupancy.shape
+    everything = range(views.images.shape[1])
+    grid = VoxelGrid((x, y, z), grid_extent, prediction.grid_center)
+    runs = parts or [(prediction.grid_center, everything)]
+    read = [] if observed is None else _read_volumes(model, views, observed, runs)
+    whole = read[0].reads if len(read) == 1 else None
+    volume = VoxelVolume(grid, everything, prediction.occupancy, prediction.seen, whole)
+    return [volume] if len(read) <= 1 else [volume, *read]
+
+
+def _read_volumes(
+    model: RayTran, views: Views, observed: ObservedAttention, runs: Sequence[tuple[Tensor, Sequence[int]]]
+) -> list[VoxelVolume]:
+    """Return the volume of each run of the network with what its voxels read."""
+    stride, (height, width) = model.backbone.stride, views.image_size
+    size = (height // stride, width // stride)
+    features = observed.runs([len(frames) * size[0] * size[1] for _, frames in runs])
+    volumes = []
+    for (center, frames), (query, key) in zip(runs, features, strict=True):
+        index = list(frames)
+        pose = views.world_from_camera[0, index].cpu()
+        cameras = Cameras(views.intrinsics[0, index].cpu(), pose, views.image_size)
+        grid = VoxelGrid(model.grid_resolution, model.grid_extent, center.to(pose))
+        pairs = trace_pairs(cameras, grid, size, model.rays_per_cell)
+        reads = pack_reads(attention_weights(query, key, pairs), pairs, size)
+        volumes.append(VoxelVolume(grid, frames, reads=reads))
+    return volumes
+
+
+def write_viewer_data(
+    folder: Path,
+    views: Views,
+    frame_ids: Sequence[str],
+    *,
+    volumes: Sequence[VoxelVolume],
+    truth: ObjectSet | None = None,
+) -> Path:
+    """Write ``viewer.npz`` into a result's folder.
+
+    Args:
+        folder: an existing folder, that of ``scene.json``.
+        views: B = 1, all frames.
+        frame_ids: name of each frame.
+        volumes: none if the network has no voxels.
+        truth: the annotated objects, or None if they are not known.
+
+    Returns:
+        the file.
+    """
+    about = {
+        "format": FORMAT,
+        "image_size": views.image_size,
+        "frame_ids": list(frame_ids),
+        "volumes": [_about_volume(volume) for volume in volumes],
+        "has_truth": truth is not None,
+    }
+    arrays: dict[str, NDArray[Any]] = {
+        "about": np.frombuffer(json.dumps(about).encode(), dtype=np.uint8),
+        "intrinsics": views.intrinsics[0].double().cpu().numpy(),
+        "world_from_camera": views.world_from_camera[0].double().cpu().numpy(),
+    }
+    for n in range(len(frame_ids)):
+        arrays[f"frame{n}"] = _jpeg(frame_image(views, n))
+    for n, volume in enumerate(volumes):
+        arrays |= {f"volume{n}_{name}": values for name, values in _volume_arrays(volume).items()}
+    if truth is not None:
+        for name in _TRUTH:
+            arrays[f"truth_{name}"] = getattr(truth, name).cpu().numpy()
+    np.savez_compressed(folder / FILE, **arrays)  # type: ignore[arg-type]
+    return folder / FILE
+
+
+def _about_volume(volume: VoxelVolume) -> dict[str, Any]:
+    grid = volume.grid
+    return {
+        "resolution": grid.resolution,
+        "extent": grid.extent,
+        "center": grid.center.tolist(),
+        "frames": list(volume.frames),
+        "feature_size": volume.reads.feature_size if volume.reads is not None else None,
+    }
+
+
+def _volume_arrays(volume: VoxelVolume) -> dict[str, NDArray[Any]]:
+    arrays: dict[str, NDArray[Any]] = {}
+    if volume.occupancy is not None:
+        arrays["occupancy"] = (volume.occupancy * 255).round().to(torch.uint8).cpu().numpy()
+    if volume.view_count is not None:
+        arrays["view_count"] = volume.view_count.clamp(max=2**15 - 1).to(torch.int16).cpu().numpy()
+    if volume.reads is not None:
+        arrays |= {name: getattr(volume.reads, name) for name in ("offsets", "steps", "weights")}
+    return arrays
+
+
+def _jpeg(image: Image.Image) -> NDArray[np.uint8]:
+    image.thumbnail((_LONGEST_SIDE, _LONGEST_SIDE))
+    content = io.BytesIO()
+    image.save(content, format="jpeg", quality=_QUALITY)
+    return np.frombuffer(content.getvalue(), dtype=np.uint8)
+
+
+def read_viewer_scene(folder: Path) -> ViewerScene:
+    """Read a result: ``scene.json``, ``meshes/NN.ply`` and ``viewer.npz``.
+
+    Without the latter, the result of ``viewer=false`` or of another program, there are objects alone.
+
+    Raises:
+        DataError: a file is damaged or of another format.
+    """
+    result = read_scene_json(folder / SCENE)
+    objects = result.objects
+    meshes = [_read_mesh(folder / f"meshes/{i:02d}.ply") for i in range(len(objects))]
+    about: dict[str, Any] = {"frame_ids": [], "image_size": (1, 1), "volumes": [], "has_truth": False}
+    arrays: dict[str, NDArray[Any]] = {
+        "intrinsics": np.zeros((0, 3, 3)),
+        "world_from_camera": np.zeros((0, 4, 4)),
+    }
+    path = folder / FILE
+    try:
+        if path.exists():
+            with np.load(path, allow_pickle=False) as file:
+                arrays = dict(file)
+            about = json.loads(arrays["about"].tobytes())
+            if about["format"] != FORMAT:
+                raise ValueError(f"format {about['format']!r}, this version reads {FORMAT!r}")
+        truth = _truth(arrays) if about["has_truth"] else None
+        height, width = about["image_size"]
+        pose = torch.from_numpy(arrays["world_from_camera"])
+        return ViewerScene(
+            scene_id=result.scene_id,
+            objects=objects,
+            meshes=meshes,
+            frame_ids=[str(name) for name in about["frame_ids"]],
+            images=[_image(arrays[f"frame{n}"]) for n in range(len(about["frame_ids"]))],
+            cameras=Cameras(torch.from_numpy(arrays["intrinsics"]), pose, (height, width)),
+            volumes=[_volume(entry, n, arrays) for n, entry in enumerate(about["volumes"])],
+            truth=truth,
+            errors=[None] * len(objects) if truth is None else object_errors(objects, truth),
+        )
+    except (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile) as error:
+        raise DataError(f"cannot read {path} ({error}): predict again") from error
+
+
+def _read_mesh(path: Path) -> trimesh.Trimesh | None:
+    if not path.is_file():
+        return None
+    try:
+        mesh = trimesh.load_mesh(path, process=False)
+    except Exception as error:  # trimesh raises whatever its parser stumbles over
+        raise DataError(f"cannot read the mesh {path} ({error}): predict again") from error
+    return mesh
+
+
+def _image(content: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    with Image.open(io.BytesIO(content.tobytes())) as image:
+        return np.asarray(image.convert("RGB"))
+
+
+def _truth(arrays: Mapping[str, NDArray[Any]]) -> ObjectSet:
+    label, center, size, rotation, symmetry, score = (
+        torch.from_numpy(arrays[f"truth_{name}"]) for name in _TRUTH
+    )
+    return ObjectSet(label, center, size, rotation, symmetry, score)
+
+
+def _volume(entry: Mapping[str, Any], number: int, arrays: Mapping[str, NDArray[Any]]) -> VoxelVolume:
+    x, y, z = entry["resolution"]
+    a, b, c = entry["extent"]
+    grid = VoxelGrid((x, y, z), (a, b, c), torch.tensor(entry["center"], dtype=torch.float64))
+    occupancy = arrays.get(f"volume{number}_occupancy")
+    view_count = arrays.get(f"volume{number}_view_count")
+    reads = None
+    if entry["feature_size"] is not None:
+        offsets, steps, weights = (arrays[f"volume{number}_{n}"] for n in ("offsets", "steps", "weights"))
+        height, width = entry["feature_size"]
+        reads = VoxelReads(offsets, steps, weights, (height, width))
+    return VoxelVolume(
+        grid=grid,
+        frames=entry["frames"],
+        occupancy=None if occupancy is None else torch.from_numpy(occupancy).reshape(x, y, z) / 255,
+        view_count=None if view_count is None else torch.from_numpy(view_count).reshape(x, y, z),
+        reads=reads,
+    )
+
+
+def find_scenes(folder: Path) -> dict[str, Path]:
+    """Return the results in a folder, by the name to call each.
+
+    Args:
+        folder: one result of ``raytran.predict``, or a folder with results in it or a little below.
+
+    Raises:
+        DataError: the folder is missing or holds none.
+    """
+    if not folder.is_dir():
+        raise DataError(f"no folder {folder}: give the output folder of `python -m raytran.predict`")
+    folder = folder.resolve()
+    if (folder / SCENE).is_file():
+        return {folder.name: folder}
+    scenes: dict[str, Path] = {}
+    for where, below, files in os.walk(folder):
+        path = Path(where)
+        if SCENE in files:
+            scenes[path.relative_to(folder).as_posix()] = path
+        finished = SCENE in files or len(path.relative_to(folder).parts) >= _DEPTH
+        below[:] = [] if finished else sorted(name for name in below if not name.startswith("."))
+    if not scenes:
+        raise DataError(
+            f"{folder} holds no {SCENE}: give the output folder of `python -m raytran.predict`, "
+            "or one with such folders in it"
+        )
+    return dict(sorted(scenes.items())[:MAX_SCENES])

@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from raytran.backbone.observed import observe_attention
+from raytran.errors import DataError
+from raytran.geometry.grid import VoxelGrid
+from raytran.structs import Views
+from raytran.viewer.data import (
+    VoxelVolume,
+    find_scenes,
+    predicted_volumes,
+    read_viewer_scene,
+    write_viewer_data,
+)
+
+from ..factories import make_model, make_views
+from .conftest import write_result
+
+
+def predict(model, views, **settings):
+    with observe_attention(model) as observed:
+        prediction = model.predict(views, with_shapes=False, **settings)
+    return prediction, observed
+
+
+def sums(reads):
+    """Return the sum of each voxel's weights, of those that read something."""
+    total = np.array([reads.of_voxel(v).weight.sum() for v in range(len(reads.offsets) - 1)])
+    return total[total > 0]
+
+
+@pytest.fixture(scope="module")
+def model():
+    return make_model()
+
+
+def test_what_voxels_read_is_told_the_same_in_chunks(model):
+    views = make_views(1, 3)
+    whole, chunked = (
+        predicted_volumes(
+            model, views, *predict(model, views, views_at_once=at_once), grid_extent=model.grid_extent
+        )[0]
+        for at_once in (None, 2)
+    )
+    assert whole.grid.resolution == tuple(whole.occupancy.shape) == model.grid_resolution
+    assert sums(whole.reads) == pytest.approx(1)
+    flat = int(whole.grid.flat_index(whole.view_count.nonzero()[0]))
+    for voxel in (flat, flat + 1):
+        one, other = whole.reads.of_voxel(voxel), chunked.reads.of_voxel(voxel)
+        dense = [np.zeros(3 * 2 * 3) for _ in range(2)]
+        for array, pixels in zip(dense, (one, other), strict=True):
+            array[(pixels.view * 2 + pixels.row) * 3 + pixels.column] = pixels.weight
+        np.testing.assert_allclose(*dense, atol=0.01)
+    read = np.diff(whole.reads.offsets).reshape(model.grid_resolution) > 0
+    assert np.array_equal(whole.view_count.numpy() > 0, read)
+
+
+def test_volumes_of_a_large_room_each_say_what_they_read(model):
+    views = make_views(1, 4)
+    centers = [torch.tensor([0.0, 0.0, 0.5]), torch.tensor([0.4, 0.0, 0.5])]
+    parts = [(centers[0], [0, 1, 2]), (centers[1], [3, 2])]
+    with observe_attention(model) as observed:
+        for center, frames in parts:
+            some = Views(
+                views.images[:, frames], views.intrinsics[:, frames], views.world_from_camera[:, frames]
+            )
+            prediction = model.predict(some, with_shapes=False, grid_center=center)
+    whole, *tiles = predicted_volumes(
+        model, views, prediction, observed, grid_extent=model.grid_extent, parts=parts
+    )
+    assert whole.reads is None
+    assert [list(tile.frames) for tile in tiles] == [[0, 1, 2], [3, 2]]
+    assert [tile.grid.center.tolist() for tile in tiles] == [center.tolist() for center in centers]
+    for tile in tiles:
+        assert sums(tile.reads) == pytest.approx(1)
+
+
+def test_a_network_without_rays_has_voxels_all_the_same(model):
+    views = make_views(1, 2)
+    prediction, _ = predict(model, views)
+    (volume,) = predicted_volumes(model, views, prediction, None, grid_extent=model.grid_extent)
+    assert volume.reads is None
+
+
+def test_a_result_comes_back_as_it_was_written(result):
+    scene = read_viewer_scene(result)
+    assert (scene.scene_id, scene.frame_ids[1]) == ("room", "000010")
+    assert [image.shape for image in scene.images] == [(48, 64, 3)] * 5
+    assert (np.abs(scene.images[2][..., 1].astype(int) - 80) < 3).all()  # see make_views; JPEG rounds
+    assert scene.cameras.position[0].tolist() == pytest.approx([3.5, 0.0, 1.6])
+    assert scene.cameras.image_size == (48, 64)
+    assert [len(mesh.faces) for mesh in scene.meshes] == [320] * 6
+    (volume,) = scene.volumes
+    assert volume.grid.resolution == (16, 16, 6)
+    assert volume.occupancy.unique().tolist() == pytest.approx([0.0, 230 / 255])
+    assert volume.view_count.max() == 5
+    assert len(scene.truth) == 6
+    assert [error.found for error in scene.errors] == [True, *[False] * 5]
+    assert [error.translation for error in scene.errors] == pytest.approx([0.0, *[0.3] * 5], abs=1e-6)
+
+
+def test_a_voxel_names_the_pixels_that_read_it(result):
+    scene = read_viewer_scene(result)
+    volume = scene.volumes[0]
+    point = np.array([1.2, -0.3, 0.2])
+    voxel = volume.voxel_at(point)
+    assert voxel == (10, 7, 1)
+    pixels = volume.pixels_of(voxel)
+    assert pixels.weight.sum() == pytest.approx(1)
+    # Each cell that was read looks at the voxel: it is no further off than cell and voxel are large.
+    for view, row, column in zip(pixels.view, pixels.row, pixels.column, strict=True):
+        camera = scene.camera(view)
+        center = volume.grid.voxel_centers()[voxel]
+        (u, v), depth = (value[0] for value in camera.project(center[None]))
+        reach = 12 + 0.5 * float(camera.intrinsics[0, 0]) / float(depth)
+        assert abs(float(u) - 16 * (column + 0.5)) < reach
+        assert abs(float(v) - 16 * (row + 0.5)) < reach
+    assert volume.voxel_at(np.array([9.0, 0, 0])) is None
+
+
+def test_in_a_large_room_the_nearest_volume_tells_what_was_read(tmp_path):
+    scene = read_viewer_scene(write_result(tmp_path / "room", in_parts=True))
+    assert len(scene.volumes) == 3
+    left, right = (scene.volume_at(np.array([x, 0.0, 0.5])) for x in (-2.0, 2.0))
+    assert (left, right) == (scene.volumes[1], scene.volumes[2])
+    busiest = np.unravel_index(np.diff(right.reads.offsets).argmax(), right.grid.resolution)
+    frames = set(right.pixels_of(tuple(int(i) for i in busiest)).view.tolist())
+    assert frames
+    assert frames <= {2, 3, 4}
+    assert scene.volume_at(np.array([0.0, 0.0, 50.0])) is None
+
+
+def test_a_result_without_the_viewers_file_has_objects_alone(tmp_path):
+    scene = read_viewer_scene(write_result(tmp_path / "room", with_viewer=False))
+    assert (len(scene.objects), len(scene.meshes), scene.images, scene.volumes) == (6, 6, [], [])
+    assert scene.truth is None
+    assert scene.errors == [None] * 6
+
+
+def test_the_same_input_gives_the_same_bytes(tmp_path):
+    written = [write_result(tmp_path / name / "room") / "viewer.npz" for name in ("one", "two")]
+    assert written[0].read_bytes() == written[1].read_bytes()
+
+
+def test_frames_are_made_small_and_masks_left_out(tmp_path, generator):
+    images = torch.rand(1, 1, 4, 600, 800, generator=generator)
+    views = Views(images, torch.eye(3)[None, None], torch.eye(4)[None, None])
+    volume = VoxelVolume(VoxelGrid((2, 2, 1), (4.0, 4.0, 2.0), torch.zeros(3)), [0])
+    with np.load(write_viewer_data(tmp_path, views, ["a/b"], volumes=[volume])) as file:
+        about = json.loads(file["about"].tobytes())
+        assert about["format"] == "raytran.viewer/1"
+        assert about["frame_ids"] == ["a/b"]
+        assert file["frame0"][:2].tobytes() == b"\xff\xd8"
+        assert not [name for name in file if name.startswith(("truth", "volume"))]
+
+
+@pytest.mark.parametrize("damage", [b"", b"PK\x03\x04", b"no archive", "another format", "a missing part"])
+def test_a_damaged_file_is_one_sentence(tmp_path, damage):
+    folder = write_result(tmp_path / "room")
+    path = folder / "viewer.npz"
+    if isinstance(damage, bytes):
+        path.write_bytes(damage)
+    else:
+        with np.load(path) as file:
+            arrays = dict(file)
+        if damage == "another format":
+            about = json.loads(arrays["about"].tobytes()) | {"format": "raytran.viewer/9"}
+            arrays["about"] = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)
+        else:
+            del arrays["volume0_steps"]
+        np.savez(path, **arrays)
+    with pytest.raises(DataError, match=r"cannot read .*viewer\.npz \(.*\): predict again"):
+        read_viewer_scene(folder)
+
+
+def test_a_damaged_mesh_is_one_sentence(tmp_path):
+    folder = write_result(tmp_path / "room")
+    (folder / "meshes" / "03.ply").write_bytes(b"ply\n")
+    with pytest.raises(DataError, match=r"cannot read the mesh .*03\.ply"):
+        read_viewer_scene(folder)
+
+
+def test_one_result_or_many(tmp_path):
+    for name in ("a/room", "b/deep/hall", ".hidden", "a/room/inside"):
+        (tmp_path / name).mkdir(parents=True, exist_ok=True)
+        (tmp_path / name / "scene.json").write_text("{}")
+    assert find_scenes(tmp_path / "a" / "room") == {"room": tmp_path / "a" / "room"}
+    assert find_scenes(tmp_path) == {
+        "a/room": tmp_path / "a" / "room",
+        "b/deep/hall": tmp_path / "b" / "deep" / "hall",
+    }
+
+
+def test_nothing_to_show(tmp_path):
+    with pytest.raises(DataError, match=r"nowhere: give the output folder of `python -m raytran\.predict`"):
+        find_scenes(tmp_path / "nowhere")
+    with pytest.raises(DataError, match=r"holds no scene\.json"):
+        find_scenes(tmp_path)
