@@ -3,9 +3,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from collections import namedtuple
 
 import pytest
@@ -76,18 +73,14 @@ def test_a_switch_that_does_not_exist_is_one_sentence(typed, settings, tmp_path)
         fit(settings, tmp_path, typed)
 
 
-WATCHED = """
-import atexit, runpy, sys, torch
-atexit.register(lambda: print("float32 is", torch.get_float32_matmul_precision()))
-sys.argv = sys.argv[1:]
-runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
-"""
+WATCHED = (
+    "import atexit, torch; atexit.register(lambda: print('float32 is', torch.get_float32_matmul_precision()))"
+)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("typed", [[], ["matmul_precision=high"], ["matmul_precision=low"]])
-@pytest.mark.parametrize("command", ["train", "evaluate", "predict"])
-def test_commands_agree_on_what_float32_is(command, typed, settings, rooms, tmp_path):
+@pytest.mark.parametrize("name", ["train", "evaluate", "predict"])
+def test_commands_agree_on_what_float32_is(name, typed, command, settings, rooms, tmp_path):
     words = {
         "train": [*settings, *SHORT],
         "evaluate": ["checkpoint=default", f"data.root={rooms}", "device=cpu", "num_views=2"],
@@ -101,15 +94,8 @@ def test_commands_agree_on_what_float32_is(command, typed, settings, rooms, tmp_
             "num_overlays=0",
             "check=false",
         ],
-    }[command]
-    done = subprocess.run(
-        [sys.executable, "-c", WATCHED, f"raytran.{command}", *words, *typed],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-    )
+    }[name]
+    done = command(name, *words, *typed, folder=tmp_path, first=WATCHED)
     if typed == ["matmul_precision=low"]:
         assert done.returncode == 1
         assert (
