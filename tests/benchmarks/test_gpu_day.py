@@ -47,7 +47,7 @@ def test_a_machine_without_a_gpu_is_told_so(tmp_path):
     assert not (tmp_path / "day").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(
     not hasattr(backend_registration, "_setup_privateuseone_for_python_backend"),
     reason="this torch takes no backend in Python",
