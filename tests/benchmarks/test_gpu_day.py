@@ -203,7 +203,7 @@ def test_lines_that_a_crash_cut_short_are_left_out(tmp_path):
     assert [entry["check"]["name"] for entry in read_entries(path)] == ["first", "second"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_ranks_take_the_steps_of_one(tmp_path, monkeypatch):
     """What several GPUs are asked for, by two processes on the CPU."""
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
