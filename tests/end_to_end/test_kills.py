@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands that are killed or asked to stop at any moment, and given again.
 
-``RAYTRAN_TEST_KILLS=10``, as ``make test-nightly`` has it, kills more often than two times. In ``test_resume``
-runs stop at each hook of the Trainer, within one process.
+``RAYTRAN_TEST_KILLS=10``, as ``make test-nightly`` has it, kills more often than two times. Runs that stop at
+each hook of the Trainer, within one process, are in ``test_resume``.
 """
 
 from __future__ import annotations
