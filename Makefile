@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-fast lint format docs notebooks resolve clean
+.PHONY: help install demo test test-fast test-nightly lint format docs notebooks resolve clean
 
 help:  ## Show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1|\2/' | column -t -s '|'
@@ -25,11 +25,14 @@ $(VENV)/.installed: pyproject.toml requirements/ci.txt
 demo: install  ## Make rooms, train the three stages, evaluate, predict, and write one page to look at (CPU, minutes)
 	GOMP_SPINCOUNT=10000 $(BIN)/python -m raytran.demo
 
-test: install  ## Run all tests
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal
+test: install  ## Run all tests but those of the night
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal -m 'not nightly'
 
 test-fast: install  ## Run the tests that take less than ten seconds each
-	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal -m 'not slow'
+	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal -m 'not slow and not nightly'
+
+test-nightly: install  ## Run the tests of the night, which take minutes each
+	OMP_NUM_THREADS=1 RAYTRAN_TEST_KILLS=10 $(BIN)/pytest -m nightly
 
 lint: install  ## Check format, style and types
 	$(BIN)/ruff format --check src tests benchmarks docs notebooks

@@ -32,6 +32,7 @@ from raytran.run.entry import compose
 from raytran.run.train.build import build_model, plain
 from raytran.structs import PADDING, ObjectSet, RawObjects
 
+from .commands import Commands
 from .factories import Trained
 from .scan_forms import INTRINSICS, encode_color, encode_sens, look_along_x, write_form
 
@@ -50,6 +51,14 @@ def shared_dir() -> Path:
     if not (folder / "realdata").is_dir():
         pytest.skip(f"reference data not found at {folder / 'realdata'}")
     return folder
+
+
+@pytest.fixture(scope="session")
+def command() -> Iterator[Commands]:
+    """Run ``python -m raytran.<name> …`` in a folder."""
+    commands = Commands()
+    yield commands
+    commands.close()
 
 
 @pytest.fixture(autouse=True)

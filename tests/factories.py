@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -87,6 +88,15 @@ def make_objects(count: int) -> ObjectSet:
         score=torch.ones(count),
         shape=torch.rand(count, 63, 63, 63) > 0.5,
     )
+
+
+def digests(root: Path) -> dict[str, str]:
+    """Return what stands for the content of every file below a folder, by its name there."""
+    return {
+        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(root.rglob("*"))
+        if path.is_file()
+    }
 
 
 class Trained(NamedTuple):

@@ -29,7 +29,7 @@ ROOTS = {
 """What a root needs besides its defaults, if anything."""
 
 
-PARTS_OF_THE_MODEL = ("model/backbone", "model/encoder", "model/size")
+PARTS_OF_THE_MODEL = ("model/backbone", "model/encoder", "model/extensions")
 
 
 def files(*folders):

@@ -47,7 +47,7 @@ def test_a_machine_without_a_gpu_is_told_so(tmp_path):
     assert not (tmp_path / "day").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.skipif(
     not hasattr(backend_registration, "_setup_privateuseone_for_python_backend"),
     reason="this torch takes no backend in Python",
@@ -203,7 +203,7 @@ def test_lines_that_a_crash_cut_short_are_left_out(tmp_path):
     assert [entry["check"]["name"] for entry in read_entries(path)] == ["first", "second"]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_ranks_take_the_steps_of_one(tmp_path, monkeypatch):
     """What several GPUs are asked for, by two processes on the CPU."""
     monkeypatch.setenv("OMP_NUM_THREADS", "1")

@@ -190,7 +190,7 @@ def test_a_steps_peak_is_taken_from_before_there_is_a_network(monkeypatch):
     assert steps.peak > 4 * 4 * trained
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_step_measures_every_stage_and_writes_a_row(tmp_path):
     for stage, name in (("stage1", "step-tiny-stage1.csv"), ("stage3", "step-tiny-stage3.csv")):
         command = [sys.executable, str(BENCHMARKS / "step.py"), "--preset", "tiny", "--stage", stage]
@@ -207,7 +207,7 @@ def test_step_measures_every_stage_and_writes_a_row(tmp_path):
         assert "objects head" not in rows
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_prediction_that_fails_ends_its_own_row(tmp_path):
     command = [sys.executable, str(BENCHMARKS / "prediction.py"), "--preset", "tiny", *SMALL]
     options = ["--views", "2", "--views-at-once", "all", "0", "--output", str(tmp_path)]

@@ -2,9 +2,15 @@
 from __future__ import annotations
 
 import subprocess
+import sys
+from importlib import metadata
 
+import lightning
+import numpy
 import torch
+import trimesh
 
+import raytran
 from raytran.checkpoints.card import git_commit, versions
 
 
@@ -43,5 +49,16 @@ def test_versions_name_the_build_of_torch(monkeypatch):
     assert type(versions()["torch"]) is str  # checkpoints hold plain Python
 
 
-def test_versions_name_torch():
-    assert {"python", "raytran", "torch", "lightning"} <= set(versions())
+def test_versions_are_those_that_run(monkeypatch):
+    found = versions()
+    assert found["python"] == ".".join(map(str, sys.version_info[:3]))
+    assert found["raytran"] == raytran.__version__
+    assert found["torch"] == torch.__version__, "with the CUDA it is for"
+    for module in (lightning, numpy, trimesh):
+        assert found[module.__name__] == module.__version__
+
+    def none(name):
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "version", none)
+    assert set(versions()) == {"python", "raytran", "torch"}, "what is not installed is left out"

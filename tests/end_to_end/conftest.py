@@ -3,10 +3,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
-
 import pytest
 
 from raytran.rooms.generate import generate_rooms
@@ -47,20 +43,3 @@ def settings(rooms):
         "schedule.log_every=1",
         "checkpoint_every=2",
     ]
-
-
-@pytest.fixture(scope="session")
-def command():
-    """Run ``python -m raytran.<name> …`` in a folder."""
-
-    def run(name, *arguments, folder):
-        return subprocess.run(
-            [sys.executable, "-m", f"raytran.{name}", *arguments],
-            cwd=folder,
-            capture_output=True,
-            text=True,
-            check=False,
-            env=os.environ | {"OMP_NUM_THREADS": "1"},
-        )
-
-    return run

@@ -16,27 +16,24 @@ from raytran.run.entry import compose
 from raytran.run.evaluate.evaluate import evaluate
 from raytran.run.export.export_model import export_model
 from raytran.run.predict.predict import predict
-from raytran.run.train.fit import train
+
+from .runs import fit
 
 STEPS = ["trainer.max_steps=1", "trainer.val_check_interval=1"]
-
-
-def fit(settings, folder, *more):
-    return train(compose("train", [*settings, *STEPS, f"output_dir={folder}", *more]))
 
 
 @pytest.fixture(scope="module")
 def weights(settings, tmp_path_factory):
     """The weights of a stage 1 of one step."""
     folder = tmp_path_factory.mktemp("exported")
-    fit(settings, folder / "run", "experiment=stage1")
+    fit([*settings, *STEPS], folder / "run", "experiment=stage1")
     words = [f"checkpoint={folder / 'run' / LAST}", f"output={folder / 'stage1.safetensors'}"]
     return export_model(compose("export_model", words))
 
 
 def test_a_stage_starts_from_weights(settings, weights, tmp_path):
     frozen = ["experiment=stage2", "check_parent=stage", "schedule.stage2.learning_rate=0"]
-    fit(settings, tmp_path / "run", *frozen, f"init_from={weights}")
+    fit([*settings, *STEPS], tmp_path / "run", *frozen, f"init_from={weights}")
     content, parent = read_checkpoint(tmp_path / "run" / LAST), read_checkpoint(weights)
     assert content["parent"]["path"] == str(weights)
     assert (content["parent"]["stage"], content["parent"]["step"]) == ("stage1", 1)
@@ -50,7 +47,7 @@ def test_a_stage_starts_from_weights(settings, weights, tmp_path):
 
 def test_weights_are_no_run_to_resume(settings, weights, tmp_path):
     with pytest.raises(CheckpointError, match=r"no state of training: start a new run with init_from="):
-        fit(settings, tmp_path / "run", "experiment=stage1", f"resume={weights}")
+        fit([*settings, *STEPS], tmp_path / "run", "experiment=stage1", f"resume={weights}")
 
 
 def test_evaluate_takes_weights(settings, weights, tmp_path, monkeypatch):

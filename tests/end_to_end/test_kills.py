@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands that are killed or asked to stop at any moment, and given again.
 
-``RAYTRAN_TEST_KILLS=10`` kills more often than the two times of an ordinary run of the tests.
+``RAYTRAN_TEST_KILLS=10``, as ``make test-nightly`` has it, kills more often than two times. Runs that stop at
+each hook of the Trainer, within one process, are in ``test_resume``.
 """
 
 from __future__ import annotations
 
-import csv
 import logging
 import os
 import random
@@ -17,12 +17,13 @@ import time
 from pathlib import Path
 
 import pytest
-import torch
 
 from raytran.checkpoints.file import read_newest
 from raytran.checkpoints.runs import FINISHED, LAST
 
-pytestmark = pytest.mark.slow
+from .runs import assert_same, table
+
+pytestmark = pytest.mark.nightly
 
 _log = logging.getLogger(__name__)
 
@@ -74,28 +75,6 @@ def wait_for_rows(process, table, count, timeout=120.0):
     assert process.poll() is not None, "the command logged nothing"
 
 
-def rows(folder):
-    with (folder / "metrics.csv").open() as file:
-        kept = [
-            {
-                name: value
-                for name, value in row.items()
-                if value and name.startswith(("train/", "val/", "step"))
-            }
-            for row in csv.DictReader(file)
-        ]
-    return [row for row in kept if len(row) > 1]
-
-
-def assert_same(folder, straight):
-    ours, theirs = (torch.load(path / LAST, weights_only=True) for path in (folder, straight))
-    assert ours["global_step"] == theirs["global_step"]
-    for name, value in theirs["state_dict"].items():
-        assert torch.equal(ours["state_dict"][name], value), name
-    assert rows(folder) == rows(straight)
-    assert len(rows(folder)) >= 10
-
-
 def wait_and_kill(process, table, count, delay, signum=signal.SIGKILL):
     """Stop the whole group of a command some time after it has logged ``count`` further rows."""
     wait_for_rows(process, table, count)
@@ -127,6 +106,7 @@ def test_killed_and_resumed_is_not_killed(base, tmp_path):
     assert steps[-1] > 0
     finish("train", folder, *arguments)
     assert_same(folder, straight)
+    assert len(table(folder)) >= 10
 
 
 def child_of(pid):
@@ -155,3 +135,4 @@ def test_a_curriculum_on_two_ranks_goes_on_after_a_signal_and_a_kill(base, tmp_p
     assert 0 < last_step(stage) < 20
     finish("curriculum", folder, *arguments)
     assert_same(stage, straight)
+    assert len(table(stage)) >= 10

@@ -12,14 +12,10 @@ import torch
 from raytran.checkpoints.runs import read_finished
 from raytran.data.scan2cad import annotation_digest, annotation_path
 from raytran.errors import ConfigError
-from raytran.run.entry import compose
-from raytran.run.train.fit import train
+
+from .runs import fit
 
 REPEATED = "scans have 6 frames, fewer than the 8 asked for: frames are repeated"
-
-
-def fit(settings, folder, *more):
-    return train(compose("train", [*settings, f"output_dir={folder}", *more]))
 
 
 @pytest.fixture(scope="module")

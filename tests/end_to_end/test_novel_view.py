@@ -35,7 +35,7 @@ def trained(settings, tmp_path_factory):
 def test_training_starts_from_stage_1_and_scores_new_views(trained):
     parent, fit = trained
     card = torch.load(fit.checkpoint, weights_only=True)
-    assert (card["stage"], card["parent"]["path"]) == ("view", str(parent.checkpoint))
+    assert (card["stage"], card["parent"]["path"]) == ("novel_view", str(parent.checkpoint))
     for name in ("psnr", "ssim", "psnr_best_constant", "psnr_nearest_frame"):
         assert math.isfinite(card["scores"][f"val/view/{name}"])
     assert len(list((fit.folder / "pictures" / "step-000002").glob("*/new_views.jpg"))) == 1

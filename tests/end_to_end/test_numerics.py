@@ -3,21 +3,18 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from collections import namedtuple
 
 import pytest
 import torch
 
 from raytran.errors import ConfigError
-from raytran.run.entry import compose
-from raytran.run.train.fit import train
 from raytran.training import datamodule
 from raytran.training.reconstruction import Reconstruction
 
-SHORT = ["trainer.max_steps=1", "trainer.val_check_interval=1"]
+from .runs import fit
+
+SHORT = ["trainer.max_steps=1", "trainer.val_check_interval=1", "init_from=none"]
 
 
 @pytest.fixture
@@ -46,13 +43,9 @@ def flags(monkeypatch):
     torch.backends.cudnn.benchmark = before[1]
 
 
-def fit(settings, folder, *more):
-    return train(compose("train", [*settings, *SHORT, "init_from=none", f"output_dir={folder}", *more]))
-
-
 @pytest.mark.parametrize("experiment", ["stage1", "stage2", "stage3", "novel_view"])
 def test_every_stage_trains_with_deterministic_operations_alone(experiment, settings, flags, tmp_path):
-    fit(settings, tmp_path, f"experiment={experiment}", "trainer.deterministic=true")
+    fit([*settings, *SHORT], tmp_path, f"experiment={experiment}", "trainer.deterministic=true")
     assert [(seen["deterministic"], seen["warn"]) for seen in flags] == [(True, False)]
 
 
@@ -66,28 +59,24 @@ def test_every_stage_trains_with_deterministic_operations_alone(experiment, sett
     ],
 )
 def test_switches_of_torch_are_as_the_run_says(typed, expected, settings, flags, tmp_path):
-    fit(settings, tmp_path, *typed)
+    fit([*settings, *SHORT], tmp_path, *typed)
     assert expected.items() <= flags[0].items()
 
 
 @pytest.mark.parametrize("typed", ["trainer.deterministic=maybe", "matmul_precision=low"])
 def test_a_switch_that_does_not_exist_is_one_sentence(typed, settings, tmp_path):
     with pytest.raises(ConfigError, match=f"unknown {typed}: choose "):
-        fit(settings, tmp_path, typed)
+        fit([*settings, *SHORT], tmp_path, typed)
 
 
-WATCHED = """
-import atexit, runpy, sys, torch
-atexit.register(lambda: print("float32 is", torch.get_float32_matmul_precision()))
-sys.argv = sys.argv[1:]
-runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
-"""
+WATCHED = (
+    "import atexit, torch; atexit.register(lambda: print('float32 is', torch.get_float32_matmul_precision()))"
+)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("typed", [[], ["matmul_precision=high"], ["matmul_precision=low"]])
-@pytest.mark.parametrize("command", ["train", "evaluate", "predict"])
-def test_commands_agree_on_what_float32_is(command, typed, settings, rooms, tmp_path):
+@pytest.mark.parametrize("name", ["train", "evaluate", "predict"])
+def test_commands_agree_on_what_float32_is(name, typed, command, settings, rooms, tmp_path):
     words = {
         "train": [*settings, *SHORT],
         "evaluate": ["checkpoint=default", f"data.root={rooms}", "device=cpu", "num_views=2"],
@@ -101,15 +90,8 @@ def test_commands_agree_on_what_float32_is(command, typed, settings, rooms, tmp_
             "num_overlays=0",
             "check=false",
         ],
-    }[command]
-    done = subprocess.run(
-        [sys.executable, "-c", WATCHED, f"raytran.{command}", *words, *typed],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-    )
+    }[name]
+    done = command(name, *words, *typed, folder=tmp_path, first=WATCHED)
     if typed == ["matmul_precision=low"]:
         assert done.returncode == 1
         assert (
@@ -130,7 +112,8 @@ def test_shared_memory_that_cannot_hold_the_scenes_is_told(
     """Scenes of three images of 64 × 64 and their masks, 49 kB and some; Docker gives 64 MB."""
     monkeypatch.setattr(datamodule, "SHARED_MEMORY", tmp_path)
     monkeypatch.setattr(datamodule.shutil, "disk_usage", lambda path: Usage(free, 0, free))
-    fit(settings, tmp_path / "run", "views.num_workers=1", "views.batch_size=2", "experiment=stage2")
+    more = ["views.num_workers=1", "views.batch_size=2", "experiment=stage2"]
+    fit([*settings, *SHORT], tmp_path / "run", *more)
     told = [record.getMessage() for record in caplog.records if "--shm-size" in record.getMessage()]
     assert len(told) == warns
     if warns:  # two batches ahead, of two scenes in training and of one in validation
@@ -139,5 +122,5 @@ def test_shared_memory_that_cannot_hold_the_scenes_is_told(
 
 def test_without_workers_shared_memory_does_not_matter(settings, monkeypatch, tmp_path, caplog):
     monkeypatch.setattr(datamodule.shutil, "disk_usage", lambda path: Usage(0, 0, 0))
-    fit(settings, tmp_path / "run", "views.num_workers=0")
+    fit([*settings, *SHORT], tmp_path / "run", "views.num_workers=0")
     assert "--shm-size" not in caplog.text

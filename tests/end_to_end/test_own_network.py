@@ -3,10 +3,10 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import re
-import subprocess
 import sys
 
 import pytest
@@ -35,22 +35,10 @@ def lab(tmp_path_factory, project_root):
 
 
 @pytest.fixture(scope="module")
-def run(lab):
+def run(lab, command):
     """Run a command as the owner of the package does."""
-
-    def run(name, *arguments):
-        return subprocess.run(
-            [sys.executable, "-m", f"raytran.{name}", *arguments],
-            cwd=lab,
-            capture_output=True,
-            text=True,
-            check=False,
-            env=os.environ
-            | {"OMP_NUM_THREADS": "1"}
-            | {"PYTHONPATH": os.pathsep.join([str(lab / "src"), os.environ.get("PYTHONPATH", "")])},
-        )
-
-    return run
+    path = os.pathsep.join([str(lab / "src"), os.environ.get("PYTHONPATH", "")])
+    return functools.partial(command, folder=lab, PYTHONPATH=path)
 
 
 @pytest.fixture(scope="module")
@@ -90,38 +78,38 @@ def test_two_stages_train_and_say_what_is_needed(fits, checkpoint):
 
 
 def test_evaluate(run, checkpoint, rooms, lab):
-    command = ("evaluate", f"checkpoint={checkpoint}", f"data.root={rooms}", "output=results")
-    refused = run(*command)
+    words = ("evaluate", f"checkpoint={checkpoint}", f"data.root={rooms}", "output=results")
+    refused = run(*words)
     assert refused.returncode == 1
     assert REFUSED in refused.stderr
     assert REMEDY in refused.stderr
     assert len(refused.stderr.splitlines()) == 1
     assert not (lab / "results").exists()
-    done = run(*command, "trust=[mylab]")
+    done = run(*words, "trust=[mylab]")
     assert done.returncode == 0, done.stderr
     assert json.loads((lab / "results" / "metrics.json").read_text())["strict"]["n_scenes"] == 1
 
 
 def test_predict(run, checkpoint, rooms, lab):
     scan = sorted((rooms / "scannet" / "scans").iterdir())[0]
-    command = ("predict", f"checkpoint={checkpoint}", f"scene={scan}", "output=prediction", "viewer=false")
-    refused = run(*command)
+    words = ("predict", f"checkpoint={checkpoint}", f"scene={scan}", "output=prediction", "viewer=false")
+    refused = run(*words)
     assert refused.returncode == 1
     assert REFUSED in refused.stderr
     assert REMEDY in refused.stderr
-    done = run(*command, "check=false", "turntable=0", "trust=[mylab]")
+    done = run(*words, "check=false", "turntable=0", "trust=[mylab]")
     assert done.returncode == 0, done.stderr
     assert (lab / "prediction" / "scene.json").is_file()
 
 
 def test_export_model_and_what_it_writes(run, checkpoint, lab, importable):
-    command = ("export_model", f"checkpoint={checkpoint}", "output=mine.safetensors")
-    refused = run(*command)
+    words = ("export_model", f"checkpoint={checkpoint}", "output=mine.safetensors")
+    refused = run(*words)
     assert refused.returncode == 1
     assert REFUSED in refused.stderr
     assert not (lab / "mine.safetensors").exists()
-    assert run(*command[:-1]).returncode == 0, "what a file says of itself needs no network"
-    done = run(*command, "trust=[mylab]")
+    assert run(*words[:-1]).returncode == 0, "what a file says of itself needs no network"
+    done = run(*words, "trust=[mylab]")
     assert done.returncode == 0, done.stderr
     # The exported file is used by the same rule, in Python too.
     for path in (checkpoint, lab / "mine.safetensors"):

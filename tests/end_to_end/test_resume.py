@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import csv
 import errno
 import os
 import random
@@ -16,9 +15,9 @@ import torch
 
 from raytran.checkpoints.runs import FINISHED, LAST, PREVIOUS, one_at_a_time
 from raytran.errors import CheckpointError, ConfigError
-from raytran.run.entry import compose
-from raytran.run.train.fit import train
 from raytran.training.reconstruction import Reconstruction
+
+from .runs import assert_same, fit, table
 
 STEPS = 8
 
@@ -32,42 +31,12 @@ def base(settings):
     """Validation after steps 3 and 6; checkpoints after 2, 4, 6."""
     return [
         *settings,
+        "resume=auto",
         f"trainer.max_steps={STEPS}",
         "watch.pictures=0",
         "trainer.val_check_interval=3",
         "checkpoint_every=2",
     ]
-
-
-def fit(base, folder, *more):
-    return train(compose("train", [*base, f"output_dir={folder}", "resume=auto", *more]))
-
-
-def table(folder):
-    """Return the logged rows; times and sizes are not the same twice."""
-    with (folder / "metrics.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    return [
-        {name: value for name, value in row.items() if value and name.startswith(("train/", "val/", "step"))}
-        for row in rows
-    ]
-
-
-def assert_same(folder, straight):
-    ours, theirs = (torch.load(path / LAST, weights_only=True) for path in (folder, straight))
-    assert ours["global_step"] == theirs["global_step"]
-    for name, value in theirs["state_dict"].items():
-        assert torch.equal(ours["state_dict"][name], value), name
-    for ours_state, theirs_state in zip(
-        ours["optimizer_states"][0]["state"].values(),
-        theirs["optimizer_states"][0]["state"].values(),
-        strict=True,
-    ):
-        assert all(torch.equal(ours_state[name], value) for name, value in theirs_state.items())
-    assert ours["lr_schedulers"][0]["last_epoch"] == theirs["lr_schedulers"][0]["last_epoch"]
-    assert torch.equal(ours["resume"]["random"][0]["torch"], theirs["resume"]["random"][0]["torch"])
-    assert ours["SceneDataModule"] == theirs["SceneDataModule"]
-    assert table(folder) == table(straight)
 
 
 def kill_at(monkeypatch, hook, call):

@@ -17,14 +17,12 @@ from raytran.data.scannet.scan import read_scan
 from raytran.errors import CheckpointError, DataError
 from raytran.run.entry import compose
 from raytran.run.export.export_model import export_model
-from raytran.run.train.fit import RANDOM_ENCODER, train
+from raytran.run.train.fit import RANDOM_ENCODER
 from raytran.training.loggers import read_history
 
+from .runs import fit
+
 ONE_STEP = ["trainer.max_steps=1", "trainer.val_check_interval=1", "watch.pictures=0"]
-
-
-def fit(settings, folder, *more):
-    return train(compose("train", [*settings, f"output_dir={folder}", *more]))
 
 
 def first_step(settings, folder, *more):

@@ -16,13 +16,13 @@ import pytest
 import torch
 
 import raytran
-from raytran.checkpoints.runs import LAST, read_finished
+from raytran.checkpoints.runs import FINISHED, LAST, read_finished
 from raytran.errors import CheckpointError, ConfigError
 from raytran.ops.triton import block_pairs
-from raytran.run.entry import compose
 from raytran.run.train.curriculum import run_curriculum
-from raytran.run.train.fit import train
 from raytran.training.loggers import read_history
+
+from .runs import fit
 
 
 @pytest.fixture(scope="module")
@@ -30,10 +30,6 @@ def trained(settings, tmp_path_factory):
     """The folder of a finished curriculum and its results."""
     folder = tmp_path_factory.mktemp("curriculum")
     return folder, run_curriculum(settings, output_dir=folder)
-
-
-def fit(settings, folder, *more):
-    return train(compose("train", [*settings, f"output_dir={folder}", *more]))
 
 
 def same_weights(a, b, prefix=""):
@@ -292,18 +288,24 @@ def test_a_stopped_run_goes_on(stop, code, settings, tmp_path, command):
 
 @pytest.mark.slow
 def test_two_processes_train_together(settings, trained, tmp_path, command):
-    parent = trained[1][0].checkpoint
+    """They stop after two of four steps, and go on."""
     run = tmp_path / "run"
     arguments = [
-        *settings,
+        *(item for item in settings if item != "trainer=cpu"),
         "trainer=ddp_cpu",
         "experiment=stage2",
-        f"init_from={parent}",
+        f"init_from={trained[1][0].checkpoint}",
         f"output_dir={run}",
+        "resume=auto",
     ]
-    done = command("train", *(a for a in arguments if a != "trainer=cpu"), folder=tmp_path)
-    assert done.returncode == 0, done.stderr
-    assert read_finished(run).steps == 4
+    for steps in (2, 4):
+        done = command("train", *arguments, f"trainer.max_steps={steps}", folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert read_finished(run).steps == steps
+        # Two scenes on each of two ranks a step.
+        counted = torch.load(run / LAST, weights_only=True)["SceneDataModule"]
+        assert counted == {"scenes": 4 * steps, "step": steps}
+        if steps == 2:
+            (run / FINISHED).unlink()
+    assert [step for step, _ in read_history(run)["train/total"]] == [0, 1, 2, 3]
     assert not any(tmp_path.glob("outputs/**/last.ckpt"))
-    # Four steps of two scenes on each of two ranks.
-    assert torch.load(run / LAST, weights_only=True)["SceneDataModule"] == {"scenes": 16, "step": 4}

@@ -77,12 +77,13 @@ def test_rooms_are_made_where_the_user_is(site: Path, tmp_path: Path) -> None:
     assert (tmp_path / "rooms" / "scan2cad" / "full_annotations.json").is_file()
 
 
-@pytest.mark.parametrize("name", ["report.html.j2", "doctor.html.j2", "page.css"])
-def test_the_page_templates_are_inside(name: str, site: Path) -> None:
-    assert (site / "raytran" / "view" / "templates" / name).is_file()
+def test_all_that_is_no_python_is_inside(site: Path, project_root: Path) -> None:
+    """Templates and weights."""
 
+    def files(package: Path) -> set[Path]:
+        found = {path.relative_to(package) for path in package.rglob("*.*") if path.is_file()}
+        return {path for path in found if path.suffix not in (".py", ".pyc") and path.parts[0] != "conf"}
 
-def test_the_folder_of_weights_is_inside(site: Path, project_root: Path) -> None:
-    folder = project_root / "src" / "raytran" / "weights"
-    expected = {path.name for path in folder.iterdir()}
-    assert {path.name for path in (site / "raytran" / "weights").iterdir()} == expected
+    assert files(site / "raytran") == files(project_root / "src" / "raytran")
+    assert any(path.suffix == ".safetensors" for path in files(site / "raytran"))
+    assert any(path.suffix == ".j2" for path in files(site / "raytran"))

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 
@@ -10,15 +9,9 @@ import pytest
 from raytran.errors import ConfigError, DataError
 from raytran.rooms.generate import generate_rooms
 
+from ..factories import digests
+
 SMALL = {"frames": 6, "image_size": (48, 64), "max_objects": 8, "progress": False, "seed": 3}
-
-
-def digests(root):
-    return {
-        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(root.rglob("*"))
-        if path.is_file()
-    }
 
 
 @pytest.fixture(scope="module")

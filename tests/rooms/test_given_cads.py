@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import shutil
 
@@ -18,16 +17,10 @@ from raytran.rooms.generate import generate_rooms
 from raytran.rooms.library import FEW, ModelPool, read_library
 from raytran.rooms.shapenet_files import write_model
 
+from ..factories import digests
+
 SMALL = {"frames": 4, "image_size": (48, 64), "max_objects": 8, "progress": False, "seed": 3, "processes": 1}
 NUMBERS = {"num_train": 2, "num_val": 1}
-
-
-def digests(root):
-    return {
-        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(root.rglob("*"))
-        if path.is_file()
-    }
 
 
 @pytest.fixture(scope="module")

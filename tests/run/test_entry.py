@@ -12,11 +12,6 @@ from raytran.errors import DataError
 from raytran.run.entry import compose, run_or_exit
 
 
-def run(*arguments, folder):
-    command = [sys.executable, "-m", *arguments]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-
-
 def raise_error(error):
     def function(cfg):
         raise error
@@ -60,8 +55,8 @@ def test_a_defect_keeps_its_traceback():
         ("schedule.joint.steps=3", "schedule.joint.steps=3 is called schedule.stage2.steps=3 now"),
     ],
 )
-def test_a_wrong_setting_is_one_sentence(tmp_path, typed, said):
-    done = run("raytran.train", typed, folder=tmp_path)
+def test_a_wrong_setting_is_one_sentence(tmp_path, typed, said, command):
+    done = command("train", typed, folder=tmp_path)
     assert done.returncode == 1
     (sentence,) = done.stderr.splitlines()
     assert sentence.startswith("raytran: ")
@@ -69,18 +64,18 @@ def test_a_wrong_setting_is_one_sentence(tmp_path, typed, said):
     assert not any(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("command", ["train", "curriculum", "evaluate", "prepare"])
-def test_help_names_the_settings_without_loading_torch(command, tmp_path):
+@pytest.mark.parametrize("name", ["train", "curriculum", "evaluate", "prepare"])
+def test_help_names_the_settings_without_loading_torch(name, tmp_path):
     code = (
         "import atexit, os, runpy, sys; sys.argv = ['x', '--help'];"
         "atexit.register(lambda: 'torch' in sys.modules and os._exit(9));"
-        f"runpy.run_module('raytran.{command}', run_name='__main__')"
+        f"runpy.run_module('raytran.{name}', run_name='__main__')"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert f"python -m raytran.{command}" in done.stdout
+    assert f"python -m raytran.{name}" in done.stdout
     assert "preset" in done.stdout
 
 

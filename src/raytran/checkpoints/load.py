@@ -138,9 +138,9 @@ def load_weights(
 def fresh_parts(model: RayTran, checkpoint: Mapping[str, Any], may_be_missing: Sequence[str]) -> list[str]:
     """Return the parts of ``model`` that a stage starts at random although it has a parent.
 
-    Those are the parts in ``may_be_missing`` of which the checkpoint has nothing, and the heads that are of another
-    form than the checkpoint's, if those are as random: it has no parent, and its stage did not train them.
-    So one stage 1 does for all object heads.
+    Those are, first, the parts in ``may_be_missing`` of which the checkpoint has nothing. Second, heads of
+    another form than the checkpoint's, if the checkpoint's were never trained: it has no parent, and its
+    stage did not train them. So one stage 1 serves all object heads.
 
     Args:
         model: the network.

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import csv
-import hashlib
 import json
 from collections import Counter
 
@@ -16,15 +15,9 @@ from raytran.rooms.sweethome3d import import_furniture
 from raytran.rooms.sweethome3d.furniture import HELD_OUT, read_table
 from raytran.structs import CLASS_BY_CATID, CLASSES
 
+from ...factories import digests
+
 QUIET = {"processes": 1, "progress": False}
-
-
-def digests(root):
-    return {
-        str(path.relative_to(root)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(root.rglob("*"))
-        if path.is_file()
-    }
 
 
 def facts_of(root, credit):

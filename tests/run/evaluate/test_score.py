@@ -6,8 +6,6 @@ from __future__ import annotations
 import csv
 import json
 import math
-import subprocess
-import sys
 
 import pytest
 from PIL import Image
@@ -385,12 +383,10 @@ def test_bad_settings(files):
         run(files, output="csv")
 
 
-def test_the_command_ends_with_one_sentence(files):
+def test_the_command_ends_with_one_sentence(files, command):
     (files / "csv" / "a.csv").write_text("a," + ROWS[0])
     settings = ["predictions=csv", "annotations=annotations.json", "output=out"]
-    done = subprocess.run(
-        [sys.executable, "-m", "raytran.evaluate", *settings], cwd=files, capture_output=True, text=True
-    )
+    done = command("evaluate", *settings, folder=files)
     assert done.returncode == 1
     assert done.stderr.startswith("raytran: csv/a.csv, line 1 has 13 columns")
     assert len(done.stderr.splitlines()) == 1
