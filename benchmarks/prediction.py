@@ -23,7 +23,7 @@ from timing import MEBIBYTE, print_machine, reason
 from raytran.geometry.camera import Cameras
 from raytran.ops.tracer import RayTracer
 from raytran.run.entry import compose
-from raytran.run.plan.forecast import prediction_bytes
+from raytran.run.plan.dry_run import dry_prediction
 from raytran.run.plan.plan import FIXED, SCRATCH
 from raytran.run.train.build import build_model
 from raytran.structs import Views
@@ -45,7 +45,7 @@ def predict_once(
     model, size = build_model(cfg, pretrained=False).eval(), tuple(cfg.views.image_size)
     cameras = cameras.scaled_to(size)
     views = len(cameras.intrinsics)
-    forecast = prediction_bytes(model, load_of(model, cameras, 1, device), views_at_once=views_at_once)
+    forecast = dry_prediction(model, load_of(model, cameras, 1, device), views_at_once=views_at_once).peak
     images = torch.randint(0, 256, (1, views, 3, *size), dtype=torch.uint8)
     lead = (cameras.intrinsics[None].float(), cameras.world_from_camera[None].float())
     if device.torch_device.type == "cpu":

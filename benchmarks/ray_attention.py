@@ -33,7 +33,7 @@ from raytran.ops.ray_attention import Direction, ray_attention
 from raytran.ops.tracer import RayTracer
 from raytran.ops.triton.block_pairs import BlockPairs
 from raytran.ops.triton.dispatch import listed
-from raytran.run.plan.ceilings import measure_ceilings
+from raytran.run.plan.roofline import measure_ceilings
 
 HEADS, CHANNELS = 8, 32
 RAYS_PER_CELL = 2

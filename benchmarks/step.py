@@ -28,7 +28,9 @@ from device import Device, this_device
 from fit import Steps, random_batch, run_steps, step_config
 from hydra.utils import instantiate
 from omegaconf import DictConfig
+from part_work import work_of_parts
 from record import write_rows
+from step_parts import Part, step_parts
 from timing import MEBIBYTE, measure, print_machine, reason
 from torch import Tensor
 
@@ -36,12 +38,10 @@ from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.model import RayTran
 from raytran.ops.tracer import RayTracer
-from raytran.ops.traverse import trace_pairs
 from raytran.ops.triton.dispatch import listed
-from raytran.run.plan.ceilings import Ceilings, measure_ceilings
-from raytran.run.plan.forecast import Load, training_bytes, work_of_parts
+from raytran.run.plan.dry_run import Load, dry_training
 from raytran.run.plan.plan import FIXED, SCRATCH
-from raytran.run.plan.step_parts import Part, step_parts
+from raytran.run.plan.roofline import Ceilings, measure_ceilings
 from raytran.run.train.build import build_model, choose_precision
 from raytran.structs import Views
 from raytran.training.stage import Stage
@@ -125,18 +125,16 @@ def forecast_bytes(cfg: DictConfig, cameras: Cameras, device: Device, precision:
     model.ray_tracer = RayTracer()  # the dry run is one on the CPU
     load = load_of(model, cameras, cfg.views.batch_size, device)
     stage: Stage = instantiate(cfg.stage, _convert_="all")
-    return round(SCRATCH * training_bytes(model, load, stage, precision=precision)) + FIXED
+    return round(SCRATCH * dry_training(model, load, stage, precision=precision).peak) + FIXED
 
 
 def load_of(model: RayTran, cameras: Cameras, scenes: int, device: Device) -> Load:
     """Return the size of a step or a prediction, as the planner wants it."""
     grid = VoxelGrid(model.grid_resolution, model.grid_extent, cameras.position.mean(dim=0))
-    stride, (height, width) = model.backbone.stride, cameras.image_size
-    tracer = model.backbone.tracer or trace_pairs
-    pairs = tracer(cameras, grid, (height // stride, width // stride), model.rays_per_cell)
+    pairs = listed(model.trace(cameras, grid))
     per_pixel = len(pairs) / pairs.num_pixels
     fused = device.torch_device.type != "cpu"
-    return Load(scenes, len(cameras.intrinsics), (height, width), per_pixel, fused=fused)
+    return Load(scenes, len(cameras.intrinsics), cameras.image_size, per_pixel, fused=fused)
 
 
 def print_step(row: dict[str, Any]) -> None:
@@ -185,15 +183,13 @@ def count_parts(
     """Return what every part must cost, and the parts."""
     cameras = Cameras.of(views)
     grid = VoxelGrid(model.grid_resolution, model.grid_extent, cameras.position.mean(dim=1))
-    stride = model.backbone.stride
-    size = (views.image_size[0] // stride, views.image_size[1] // stride)
-    pairs = model.ray_tracer(cameras, grid, size, model.rays_per_cell)
+    pairs = model.trace(cameras, grid)
     count = len(listed(pairs))
     tera, giga = ceilings.operations_per_second / 1e12, ceilings.bytes_per_second / 1e9
     print(f"ceilings: {tera:.3g} TFLOP/s, {giga:.4g} GB/s; {count:,} pairs; {precision}")
     fused = device.torch_device.type != "cpu"
     load = Load(*views.images.shape[:2], views.image_size, count / pairs.num_pixels, fused)
-    work = work_of_parts(model, load, training=True, precision=precision, stage=stage)
+    work = work_of_parts(model, load, precision=precision, stage=stage)
     parts = step_parts(model, views, pairs, tasks=stage.tasks)
     rows = [
         {
@@ -203,7 +199,7 @@ def count_parts(
             "least_bytes": work[part.name].bytes,
             "operations_per_second": ceilings.operations_per_second,
             "bytes_per_second": ceilings.bytes_per_second,
-            "floor_s": work[part.name].seconds(ceilings.operations_per_second, ceilings.bytes_per_second),
+            "floor_s": work[part.name].seconds(ceilings),
         }
         for part in parts
     ]

@@ -27,7 +27,7 @@ from raytran.geometry.boxes import box_iou as exact_iou
 from raytran.geometry.camera import Cameras
 from raytran.ops.ray_attention import Direction
 from raytran.run.plan.camera_paths import walk
-from raytran.run.plan.ceilings import measure_ceilings
+from raytran.run.plan.roofline import measure_ceilings
 
 TRAVERSAL_MS, STEP_MS = 3.0, 25.0
 """On an H200; the second is aimed at."""

@@ -28,6 +28,11 @@ _GROUP_RECORDS = ("sweep.json", "curriculum.json")
 """Files by which the folder of a sweep or of a curriculum is known."""
 
 
+def was_logged_step(trainer: Any) -> bool:
+    """Say, after a step, whether it is one of those whose losses Lightning logs."""
+    return trainer.global_step % trainer.log_every_n_steps == 0
+
+
 class MetricsTable(Logger):
     """One CSV file for a whole run: a resumed run appends to it, without a step that comes twice.
 

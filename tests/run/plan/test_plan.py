@@ -14,9 +14,9 @@ from PIL import Image
 
 from raytran.errors import ConfigError, DataError
 from raytran.run.entry import compose
-from raytran.run.plan.ceilings import Ceilings, measure_ceilings
-from raytran.run.plan.forecast import Load, training_bytes
+from raytran.run.plan.dry_run import Load, dry_training
 from raytran.run.plan.plan import GIBIBYTE, Need, advice, parse_size, plan
+from raytran.run.plan.roofline import Ceilings, measure_ceilings
 from raytran.run.train.build import build_model
 
 FAST = ["preset=tiny", "ceilings=[1,10]"]
@@ -120,7 +120,7 @@ import torch
 from raytran.run.train.build import build_model
 from raytran.run.plan.camera_paths import walk
 from raytran.run.entry import compose
-from raytran.run.plan.forecast import Load, prediction_bytes
+from raytran.run.plan.dry_run import Load, dry_prediction
 from raytran.run.plan.plan import FIXED, SCRATCH
 from raytran.structs import Views
 
@@ -130,7 +130,7 @@ def status(name):
 
 model = build_model(compose("train", ["preset=tiny", "output_dir=x"])).eval()
 size = (192, 256)
-forecast = prediction_bytes(model, Load(1, 48, size, 40.0, fused=False), views_at_once=None)
+forecast = dry_prediction(model, Load(1, 48, size, 40.0, fused=False), views_at_once=None).peak
 cameras = walk(48).scaled_to(size)
 lead = (cameras.intrinsics[None].float(), cameras.world_from_camera[None].float())
 Path("/proc/self/clear_refs").write_text("5")
@@ -153,7 +153,7 @@ def test_views_to_be_rendered_need_memory_in_training() -> None:
     del cfg.model.grid
     model, load = build_model(cfg, pretrained=False), Load(1, 3, (96, 128), 20.0, fused=False)
     few, many = (
-        training_bytes(model, load, instantiate(cfg.stage, new_views=count, _convert_="all"))
+        dry_training(model, load, instantiate(cfg.stage, new_views=count, _convert_="all")).peak
         for count in (1, 17)
     )
     # Of 16 more views at least their images and the widest layer of the head at full and at half size.

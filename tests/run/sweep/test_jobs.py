@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import sys
 import textwrap
@@ -13,8 +14,7 @@ from omegaconf import OmegaConf
 from raytran.checkpoints.runs import write_finished
 from raytran.errors import ConfigError
 from raytran.run.sweep.folder import last_value, own_settings, read_record, sweep_folder, write_record
-from raytran.run.sweep.jobs import Job, JobPool
-from raytran.run.sweep.table import FINISHED, FINISHED_BEFORE, JobResult, merged_rows, report
+from raytran.run.sweep.launcher import FAILED, FINISHED, RESULTS, Job, run_jobs, write_results
 
 WRITES_WHAT_IT_SEES = textwrap.dedent(
     """
@@ -31,7 +31,7 @@ WRITES_WHAT_IT_SEES = textwrap.dedent(
 def job(folder, number=0, devices=1, accelerator="gpu"):
     trainer = {"accelerator": accelerator, "devices": devices}
     config = OmegaConf.create({"trainer": trainer, "optimized_metric": "val/total"})
-    return Job(number, (f"seed={number}",), folder / str(number), config, "train", f"seed={number}")
+    return Job(number, (f"seed={number}", "preset=tiny"), folder / str(number), config)
 
 
 @pytest.mark.parametrize(
@@ -47,7 +47,7 @@ def job(folder, number=0, devices=1, accelerator="gpu"):
     ],
 )
 def test_gpus_that_a_job_needs(tmp_path, devices, accelerator, wanted):
-    assert job(tmp_path, devices=devices, accelerator=accelerator).gpus(4) == wanted
+    assert job(tmp_path, devices=devices, accelerator=accelerator).gpus_needed(4) == wanted
 
 
 def test_no_two_jobs_share_a_gpu(tmp_path, monkeypatch, lock):
@@ -56,8 +56,8 @@ def test_no_two_jobs_share_a_gpu(tmp_path, monkeypatch, lock):
     )
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     jobs = [job(tmp_path, number, devices) for number, devices in enumerate((2, 1, 2, 3))]
-    pool = JobPool(3, ["3", "5", "7"], [], lock)
-    pool.run(jobs)
+    assert run_jobs(jobs, ["3", "5", "7"], [], lock, limit=3) == 0
+    assert [item.status for item in jobs] == [FAILED] * 4, "they leave no mark of a finished run"
     seen = [json.loads((item.folder / "seen.json").read_text()) for item in jobs]
     assert [gpus for gpus, *_ in seen[:2]] == ["3,5", "7"]
     assert sorted(seen[3][0].split(",")) == ["3", "5", "7"]
@@ -89,12 +89,43 @@ def test_the_metric_of_a_run_and_of_a_curriculum(tmp_path):
     assert last_value(tmp_path / "both", "val/total")[0] == 1.0
 
 
+def finish(job):
+    """Leave what a finished run leaves: a mark and a table of metrics."""
+    job.folder.mkdir()
+    write_finished(job.folder, stage="stage1", preset="tiny", experiment="stage1", steps=4)
+    (job.folder / "metrics.csv").write_text(f"step,epoch,val/total,train/x\n2,0,0.{job.number}5,1\n")
+    job.status = FINISHED
+    return job
+
+
+def record(folder, jobs):
+    listed = [{"overrides": list(item.overrides), "folder": item.folder.name} for item in jobs]
+    write_record(folder, "train", ["seed=0,1"], listed)
+
+
 def test_a_metric_that_nobody_logged_is_named(tmp_path, caplog):
-    done = job(tmp_path)
-    done.folder.mkdir()
-    (done.folder / "metrics.csv").write_text("step,epoch,val/shape,train/shape\n2,0,1,1\n")
-    assert done.result(FINISHED, 0).value is None
-    assert "job 0 logged no val/total: optimized_metric can be val/shape" in caplog.text
+    done = finish(job(tmp_path))
+    done.config.optimized_metric = "val/else"
+    record(tmp_path, [done])
+    assert write_results(tmp_path, [done]) == {0: None}
+    assert "job 0 logged no val/else: optimized_metric can be val/total" in caplog.text
+
+
+def test_results_have_every_job_of_the_sweep_whichever_call_has_run_it(tmp_path, caplog):
+    caplog.set_level("INFO", "raytran")
+    earlier, failed, never = finish(job(tmp_path)), job(tmp_path, 1), job(tmp_path, 2)
+    failed.status = FAILED
+    record(tmp_path, [earlier, failed, never])
+    assert write_results(tmp_path, [failed]) == {0: 0.05, 1: None, 2: None}
+    with (tmp_path / RESULTS).open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["seed"], row["status"], row["value"], row["steps"]) for row in rows] == [
+        ("0", "finished", "0.05", "4"),
+        ("1", "failed", "", ""),
+        ("2", "not started", "", ""),
+    ]
+    assert rows[0]["preset"] == "tiny"
+    assert "job 0: seed=0 finished, val/total = 0.05" in caplog.text, "what all jobs share says nothing"
 
 
 def test_settings_of_the_sweep_are_not_the_jobs():
@@ -120,27 +151,3 @@ def test_a_sweep_is_found_by_what_was_typed(tmp_path):
     (earlier / "sweep.json").write_text("{")
     with pytest.raises(ConfigError, match=r"sweep\.json is damaged: delete it"):
         found("preset=tiny", "seed=1,2")
-
-
-def result(folder, number, status, **more):
-    usual = {"exit_code": None, "metric": "val/total", "value": 0.25, "steps": 4, "seconds": 0.0}
-    settings = (f"seed={number}", "preset=tiny")
-    return JobResult(
-        number=number, overrides=settings, folder=folder / str(number), status=status, **(usual | more)
-    )
-
-
-def test_the_table_keeps_what_earlier_calls_found(tmp_path, capsys):
-    report(tmp_path, [result(tmp_path, n, FINISHED, exit_code=0, seconds=9.0) for n in (0, 1)])
-    shown = capsys.readouterr().out
-    assert "seed" in shown
-    assert "preset" not in shown, "what all jobs share says nothing"
-    report(tmp_path, [result(tmp_path, 1, FINISHED_BEFORE), result(tmp_path, 2, FINISHED, value=None)])
-    rows = merged_rows(tmp_path, [])
-    assert [(row["job"], row["status"], row["seconds"]) for row in rows] == [
-        ("0", "finished", "9.0"),
-        ("1", "finished", "9.0"),
-        ("2", "finished", "0.0"),
-    ]
-    assert [row["value"] for row in rows] == ["0.25", "0.25", ""]
-    assert rows[2]["preset"] == "tiny"

@@ -43,11 +43,11 @@ JOB = textwrap.dedent(
 )
 COMMAND = """
 import sys
-from raytran.run.sweep import jobs as sweep_jobs
-from raytran.run.sweep.jobs import Job
+from raytran.run.sweep import launcher
+from raytran.run.sweep.launcher import Job
 LOGGED = "val/occupancy/iou"
 # Lightning's part in reading a table of metrics would take longer than everything else here.
-sweep_jobs.last_value = lambda folder, metric: (
+launcher.last_value = lambda folder, metric: (
     float((folder / "value").read_text()) if metric == LOGGED else None, [LOGGED]
 )
 real = Job.command

@@ -1,181 +1,329 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The memory of a step or a prediction, from running it on tensors without data.
+"""Memory and work of a training step or a prediction, from running it on tensors without data.
 
-The network's own code runs on torch's fake tensors, which have sizes and a life but no data, while a tally of
-the living ones is kept: so whatever the code keeps for its backward pass, frees, chunks or computes again is
-in the figure. Only what depends on the values of a tensor, the pairs and what runs along them, is replaced by
-stand-ins that allocate what the real thing does. Scratch memory inside one operation of torch is not seen.
+The network's own code runs on torch's fake tensors, which have sizes and a device but no data, while a tally
+is kept of those alive: whatever the code keeps for its backward pass, frees, takes in chunks or computes
+again is in the figure. Pairs alone depend on data; they are replaced by as many without data. Attention and
+splat are operators of torch that know their sizes; two of them have stand-ins (``StandIns``). Scratch memory
+inside an operator is not seen. torch's own tracker, ``torch.distributed._tools.MemTracker``, would do but for
+frozen weights, on which it fails.
 """
 
 from __future__ import annotations
 
 import copy
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 from torch._subclasses.fake_tensor import FakeTensorMode
 from torch.autograd.function import once_differentiable
+from torch.autograd.graph import _engine_run_backward
+from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-import raytran.backbone.block
-import raytran.backbone.chunked
-import raytran.backbone.image_features
-import raytran.extensions.unprojection
-import raytran.ops.tracer
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.model import RayTran
-from raytran.ops.pairs import PairList
+from raytran.model import SHAPES_AT_ONCE, RayTran
+from raytran.ops.pairs import PairList, PairOrder, Side
+from raytran.run.plan.roofline import Ceilings, Work, work_of_adamw, work_of_attention, work_of_operation
+from raytran.structs import RawScene, Views
+from raytran.training.stage import Stage
+
+MATCHED_OBJECTS = 30
+"""Objects of a scene whose shapes are decoded in training; ScanNet's rooms have 14 on average."""
+
+_AUTOCAST = {"16-mixed": torch.float16, "bf16-mixed": torch.bfloat16, "32-true": None}
+PRECISIONS = tuple(_AUTOCAST)
 
 
-class LiveMemory(TorchDispatchMode):
-    """Keeps the tally of the bytes of all tensors alive that came up while it was on."""
+@dataclass(frozen=True)
+class Load:
+    """The size of a step.
+
+    Attributes:
+        scenes: B.
+        views: N of each scene.
+        image_size: ``(H, W)``.
+        pairs_per_pixel: P over the cells of all feature maps.
+        fused: attention runs in fused kernels, as on a GPU.
+    """
+
+    scenes: int
+    views: int
+    image_size: tuple[int, int]
+    pairs_per_pixel: float
+    fused: bool
+
+    def fake_views(self, channels: int) -> Views:
+        """Return views without data; to be called in a ``FakeTensorMode``."""
+        lead = (self.scenes, self.views)
+        images = torch.empty(*lead, channels, *self.image_size, dtype=torch.uint8)
+        return Views(images, torch.empty(*lead, 3, 3), torch.empty(*lead, 4, 4))
+
+
+class FakePairs(PairList):
+    """Pairs without data: as many as there would be."""
+
+    @classmethod
+    def of(cls, num_pixels: int, num_voxels: int, pairs_per_pixel: float) -> FakePairs:
+        """Return pairs; to be called in a ``FakeTensorMode``."""
+        index = torch.empty(2, round(pairs_per_pixel * num_pixels), dtype=torch.int64)
+        return cls(index[0], index[1], num_pixels, num_voxels)
+
+    def by(self, rows: Side) -> PairOrder:
+        """Return one of the two orders."""
+        count = self.num_pixels if rows == "pixels" else self.num_voxels
+        offsets = torch.empty(count + 1, dtype=torch.int32)
+        return PairOrder(offsets, torch.empty_like(self.pixel_index, dtype=torch.int32), self.pixel_index)
+
+
+class Tally(TorchDispatchMode):
+    """Counts the bytes of all tensors alive that came up while it was on, and the work that was done.
+
+    Attributes:
+        live: bytes alive.
+        peak: the most there were.
+        work: of each operation.
+    """
 
     def __init__(self) -> None:
         super().__init__()
         self.live = 0
         self.peak = 0
-        self._known: set[int] = set()
+        self.work: list[Work] = []
+        self._storages: set[int] = set()
 
-    def track(self, tensors: Any) -> None:
-        """Count tensors (or whatever holds some) until they are freed; each storage once."""
-        for tensor in tree_leaves(tensors):
-            if isinstance(tensor, Tensor):
-                storage = tensor.untyped_storage()
-                if id(storage) not in self._known:
-                    self._known.add(id(storage))
-                    self.live += storage.nbytes()
-                    weakref.finalize(storage, self._freed, id(storage), storage.nbytes())
-        self.peak = max(self.peak, self.live)
-
-    def _freed(self, key: int, size: int) -> None:
-        self._known.discard(key)
-        self.live -= size
+    def seconds(self, ceilings: Ceilings) -> float:
+        """Return the least time that the work takes."""
+        return sum(work.seconds(ceilings) for work in self.work)
 
     def __torch_dispatch__(
         self, function: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
         out = function(*args, **(kwargs or {}))
-        self.track(out)
+        for tensor in tree_leaves(out):
+            if isinstance(tensor, Tensor):
+                self._follow(tensor.untyped_storage())
+        self.peak = max(self.peak, self.live)
+        self.work.append(_work(function, args, kwargs or {}, out))
         return out
 
+    def _follow(self, storage: torch.UntypedStorage) -> None:
+        """Count a storage from now until it is freed, however many tensors look into it."""
+        key, size = id(storage), storage.nbytes()
+        if key not in self._storages:
+            self._storages.add(key)
+            self.live += size
+            weakref.finalize(storage, self._freed, key, size)
 
-def fake_copy(model: RayTran) -> RayTran:
-    """Return the model with weights that have no data; to be called in a ``FakeTensorMode``."""
-    blank = copy.copy(model)
-    for part in _copy_tree(blank).modules():
-        for name, weight in part._parameters.items():
-            if weight is not None:
-                empty = torch.empty(weight.shape, dtype=weight.dtype)
-                part._parameters[name] = nn.Parameter(empty, weight.requires_grad)
-        for name, buffer in part._buffers.items():
-            if buffer is not None:
-                part._buffers[name] = torch.empty(buffer.shape, dtype=buffer.dtype)
-    return blank
+    def _freed(self, key: int, size: int) -> None:
+        self._storages.discard(key)
+        self.live -= size
 
 
-def _copy_tree(module: nn.Module) -> nn.Module:
-    """Give a shallow copy its own dictionaries of parts, parameters and buffers, all the way down."""
-    module._parameters, module._buffers = dict(module._parameters), dict(module._buffers)
-    module._modules = {
-        name: None if part is None else _copy_tree(copy.copy(part)) for name, part in module._modules.items()
-    }
-    return module
+def _work(function: Any, args: tuple[Any, ...], kwargs: dict[str, Any], out: Any) -> Work:
+    """Return the work of an operation, of attention over a pair list by the number of its pairs."""
+    name = function.name()
+    if not name.startswith("raytran::pair_attention"):
+        return work_of_operation(function, args, kwargs, out)
+    backward = name.startswith("raytran::pair_attention_backward")
+    (query, key), (_, column, _) = (args[1][:2], args[2]) if backward else (args[:2], args[3])
+    targets, heads, width = query.shape
+    rows = targets + key.shape[0]
+    return work_of_attention(len(column), rows, heads * width, query.element_size(), backward=backward)
 
 
-@contextmanager
-def stand_ins(pairs_per_pixel: float, *, fused: bool) -> Iterator[None]:
-    """Let the network run on fake tensors: pairs by number, attention and splat by what they allocate.
+class StandIns(TorchFunctionMode):
+    """Replaces operators of raytran that do not run as they are without data.
+
+    The splat's backward pass multiplies sparse matrices, which torch cannot do without data. Attention on a
+    GPU keeps less than over a pair list; its kernels may not be installed where one plans.
 
     Args:
-        pairs_per_pixel: P over the cells of all feature maps.
-        fused: attention keeps a number per target and head; False: a weight per pair and head.
+        tally: gets the work of attention on a GPU.
+        load: the size of the step.
+        num_voxels: of all scenes.
+        dtype: of the features.
     """
 
-    def trace_pairs(
-        cameras: Cameras, grid: VoxelGrid, feature_size: tuple[int, int], rays_per_cell: int = 2
-    ) -> PairList:
-        scenes, views = cameras.intrinsics.shape[:2]
-        pixels = scenes * views * feature_size[0] * feature_size[1]
-        index = torch.empty(2, round(pairs_per_pixel * pixels), dtype=torch.int64)
-        return PairList(index[0], index[1], pixels, scenes * grid.num_voxels)
+    def __init__(self, tally: Tally, load: Load, num_voxels: int, dtype: torch.dtype) -> None:
+        super().__init__()
+        self._tally, self._load, self._num_voxels, self._dtype = tally, load, num_voxels, dtype
 
-    def pair_centers(cameras: Cameras, grid: VoxelGrid, feature_size: tuple[int, int]) -> PairList:
-        return trace_pairs(cameras, grid, feature_size)
+    def __torch_function__(
+        self, function: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        if function is torch.ops.raytran.pair_mean.default:
+            return _Splat.apply(args[0], args[1][0].shape[0] - 1, self)
+        if function is torch.ops.raytran.pair_attention.default and self._load.fused:
+            return _FusedAttention.apply(*args[:3], self)
+        return function(*args, **(kwargs or {}))
 
-    def ray_attention(query: Tensor, key: Tensor, value: Tensor, pairs: PairList, *_: Any, **__: Any) -> Any:
-        kept = query.shape[0] if fused else len(pairs)
-        return _Attention.apply(query, key, value, kept, fused)
+    def add_splat(self, num_pixels: int, num_voxels: int, channels: int) -> None:
+        """Enter the work of one pass of the splat: an addition a pair and channel, each row moved once."""
+        moved = (num_pixels + num_voxels) * channels * self._dtype.itemsize
+        self._tally.work.append(Work(self._load.pairs_per_pixel * num_pixels * channels, moved))
 
-    def splat_features(features: Tensor, pairs: PairList) -> tuple[Tensor, Tensor]:
-        return _Splat.apply(features, pairs.num_voxels), torch.empty(pairs.num_voxels, dtype=torch.bool)
+    def add_attention(self, query: Tensor, key: Tensor, *, backward: bool) -> None:
+        """Enter the work of one pass of attention."""
+        rows = len(query) + len(key)
+        pairs = self._load.pairs_per_pixel * (rows - self._num_voxels)
+        channels, size = query.shape[1] * query.shape[2], self._dtype.itemsize
+        self._tally.work.append(work_of_attention(pairs, rows, channels, size, backward=backward))
 
-    def ray_attention_with_sum(*arguments: Any) -> tuple[Tensor, Tensor]:
-        out = ray_attention(*arguments)
-        return out, torch.empty(out.shape[:2], dtype=torch.float32)
-
-    replaced = {
-        raytran.ops.tracer: (trace_pairs,),
-        raytran.extensions.unprojection: (pair_centers,),
-        raytran.backbone.block: (ray_attention,),
-        raytran.backbone.image_features: (splat_features,),
-        raytran.backbone.chunked: (ray_attention, splat_features, ray_attention_with_sum),
-    }
-    real = [(module, f.__name__, getattr(module, f.__name__)) for module, fs in replaced.items() for f in fs]
-    try:
-        for module, functions in replaced.items():
-            for function in functions:
-                setattr(module, function.__name__, function)
-        yield
-    finally:
-        for module, name, function in real:
-            setattr(module, name, function)
+    def kept(self, tensor: Tensor) -> Tensor:
+        """Return what the kernels keep of a tensor: they take it in the dtype of the features."""
+        return tensor.to(self._dtype)
 
 
-class _Attention(torch.autograd.Function):
-    """Allocates what ``ray_attention`` does."""
+class _FusedAttention(torch.autograd.Function):
+    """Returns what ``raytran::pair_attention`` does, and keeps a number a target and head."""
 
     @staticmethod
-    def forward(ctx: Any, query: Tensor, key: Tensor, value: Tensor, kept: int, fused: bool) -> Tensor:
-        out = torch.empty_like(query)
-        # The sparse path computes in float32, the fused kernels in the dtype that comes in.
-        used = (query, key, value) if fused else (query.float(), key.float(), value.float())
-        ctx.save_for_backward(*used, torch.empty(query.shape[1], kept), *((out,) if fused else ()))
-        return out
+    def forward(ctx: Any, query: Tensor, key: Tensor, value: Tensor, mode: StandIns) -> tuple[Tensor, ...]:
+        mode.add_attention(query, key, backward=False)
+        ctx.mode = mode
+        logsumexp, nothing, sums = (query.new_empty(query.shape[:2]), query.new_empty(0), query.new_empty(0))
+        ctx.save_for_backward(*(mode.kept(tensor) for tensor in (query, key, value)), logsumexp)
+        return torch.empty_like(query), logsumexp.clone(), nothing, sums
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        query, key, value = ctx.saved_tensors[:3]
-        return *(torch.empty_like(x).to(grad.dtype) for x in (query, key, value)), None, None
+    def backward(ctx: Any, grad: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
+        query, key, value, _logsumexp = ctx.saved_tensors
+        ctx.mode.add_attention(query, key, backward=True)
+        return *(torch.empty_like(tensor, dtype=grad.dtype) for tensor in (query, key, value)), None
 
 
 class _Splat(torch.autograd.Function):
-    """Allocates what ``splat_features`` does."""
+    """Returns what ``raytran::pair_mean`` does."""
 
     @staticmethod
-    def forward(ctx: Any, features: Tensor, num_voxels: int) -> Tensor:
-        ctx.like = features.shape, features.dtype
-        return features.float().new_empty(num_voxels, features.shape[1]).to(features.dtype)
+    def forward(ctx: Any, features: Tensor, num_voxels: int, mode: StandIns) -> Tensor:
+        ctx.sizes, ctx.mode = (features.shape[0], num_voxels, features.shape[1]), mode
+        mode.add_splat(*ctx.sizes)
+        return features.new_empty(num_voxels, features.shape[1])
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-        return grad.new_empty(ctx.like[0], dtype=torch.float32).to(ctx.like[1]), None
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None]:
+        ctx.mode.add_splat(*ctx.sizes)
+        return grad.new_empty(ctx.sizes[0], ctx.sizes[2]), None, None
 
 
-def peak_bytes(run: Callable[[LiveMemory], None]) -> int:
-    """Return the most bytes alive at once while ``run`` works on fake tensors.
+def fake_copy(model: RayTran, pairs_per_pixel: float) -> RayTran:
+    """Return the model with weights and pairs that have no data; to be called in a ``FakeTensorMode``."""
+    tensors: dict[int, Any] = {
+        id(weight): nn.Parameter(torch.empty(weight.shape, dtype=weight.dtype), weight.requires_grad)
+        for weight in model.parameters()
+    }
+    tensors |= {id(buffer): torch.empty(buffer.shape, dtype=buffer.dtype) for buffer in model.buffers()}
+    network = copy.deepcopy(model, tensors)
 
-    Args:
-        run: makes its tensors itself; gets the tally, to which it may enter some.
+    def ray_tracer(
+        cameras: Cameras, grid: VoxelGrid, feature_size: tuple[int, int], rays_per_cell: int
+    ) -> PairList:
+        scenes, views = cameras.intrinsics.shape[:2]
+        pixels = scenes * views * feature_size[0] * feature_size[1]
+        return FakePairs.of(pixels, scenes * grid.num_voxels, pairs_per_pixel)
+
+    def trace(cameras: Cameras, grid: VoxelGrid) -> PairList:
+        stride, (height, width) = network.backbone.stride, cameras.image_size
+        return ray_tracer(cameras, grid, (height // stride, width // stride), network.rays_per_cell)
+
+    without_data: Any = network
+    without_data.ray_tracer, without_data.trace = ray_tracer, trace
+    return network
+
+
+@contextmanager
+def dry_network(model: RayTran, load: Load, precision: str) -> Iterator[tuple[RayTran, Tally]]:
+    """Give a network without data whose work and memory are tallied while the block runs."""
+    tally, dtype = Tally(), _AUTOCAST[precision]
+    voxels = load.scenes * VoxelGrid(model.grid_resolution, model.grid_extent, torch.zeros(3)).num_voxels
+    with FakeTensorMode(), tally, StandIns(tally, load, voxels, dtype or torch.float32):
+        # The masks of fused kernels take a fortieth of what a list of pairs does: they count as nothing.
+        yield fake_copy(model, 0.0 if load.fused else load.pairs_per_pixel), tally
+
+
+@contextmanager
+def autocast(precision: str) -> Iterator[None]:
+    """Compute in one of ``PRECISIONS``."""
+    dtype = _AUTOCAST[precision]
+    with torch.autocast("cpu", dtype=dtype or torch.bfloat16, enabled=dtype is not None):
+        yield
+
+
+def backward(output: Tensor) -> None:
+    """Run the backward pass with the stand-ins in force, for blocks that are computed again in it.
+
+    ``Tensor.backward`` would suspend them, as all functions that a ``TorchFunctionMode`` could replace do.
     """
-    memory = LiveMemory()
-    with FakeTensorMode(), memory:
-        run(memory)
-    return memory.peak
+    options = {"allow_unreachable": True, "accumulate_grad": True}
+    _engine_run_backward((output,), (torch.ones_like(output),), False, False, (), **options)
+
+
+def dry_training(model: RayTran, load: Load, stage: Stage, *, precision: str = "32-true") -> Tally:
+    """Return the memory of a training step with AdamW, that of the weights included, and its work."""
+    with dry_network(model, load, precision) as (network, tally):
+        stage.freeze(network)
+        stage.set_modes(network)
+        trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
+        moments = [torch.empty_like(parameter) for parameter in trained for _ in range(2)]
+        views = load.fake_views(network.backbone.encoder.input_channels)
+        new_views = replace(load, views=stage.new_views).fake_views(3)
+        with autocast(precision):
+            raw = network(views, tasks=stage.tasks, new_cameras=Cameras.of(new_views))
+            loss = _loss(network, raw, stage, new_views)
+        del raw
+        backward(loss)
+        del moments
+    tally.work.append(work_of_adamw(sum(parameter.numel() for parameter in trained)))
+    return tally
+
+
+def dry_prediction(
+    model: RayTran, load: Load, *, views_at_once: int | None, precision: str = "32-true"
+) -> Tally:
+    """Return the memory of ``RayTran.predict``, that of the weights included, and its work."""
+    with dry_network(model, load, precision) as (network, tally), torch.no_grad():
+        network.eval()
+        views = load.fake_views(network.backbone.encoder.input_channels)
+        with autocast(precision):
+            raw = network(views, views_at_once=views_at_once)
+            masks = [logits.float().sigmoid() for logits in (raw.occupancy, raw.foreground)]
+            if "shape" in network.heads:
+                embedding = raw.objects[-1].embedding[0]
+                masks += [network.decode_shapes(some) for some in embedding.split(SHAPES_AT_ONCE)]
+    return tally
+
+
+def _loss(network: RayTran, raw: RawScene, stage: Stage, new_views: Views) -> Tensor:
+    """Return a scalar that depends on what the stage's loss depends on, through the same tensors."""
+
+    def cross_entropy(logits: Tensor) -> Tensor:
+        target = torch.empty(logits.shape, dtype=torch.bool)
+        return F.binary_cross_entropy_with_logits(logits.float(), target.float())
+
+    terms: list[Tensor] = []
+    dense = {"occupancy": raw.occupancy, "foreground": raw.foreground}
+    terms += [
+        cross_entropy(logits) for name, logits in dense.items() if name in stage.terms and logits is not None
+    ]
+    if "view" in stage.terms and raw.new_views is not None:
+        terms.append(F.mse_loss(raw.new_views.float().sigmoid(), new_views.colors()))
+    # Matching depends on data; what the loss keeps of so few numbers counts nothing.
+    for layer in (raw.objects or ()) if "objects" in stage.terms else ():
+        terms += [x.sum() for x in (layer.class_logits, layer.center, layer.log_size, layer.yaw_vector)]
+    if "shape" in stage.terms and raw.objects is not None:
+        embedding = raw.objects[-1].embedding.flatten(0, 1)
+        shapes = network.decode_shapes(embedding[: MATCHED_OBJECTS * raw.grid_center.shape[0]])
+        terms.append(cross_entropy(shapes))
+    return torch.stack([term.float() for term in terms]).sum()

@@ -16,13 +16,15 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from raytran.backbone.backbone import Backbone
 from raytran.errors import ConfigError
 from raytran.geometry.grid import VoxelGrid
 from raytran.model import RayTran
-from raytran.ops.traverse import trace_pairs
+from raytran.ops.tracer import RayTracer
+from raytran.ops.triton.dispatch import listed
 from raytran.run.plan.camera_paths import recorded, walk
-from raytran.run.plan.ceilings import Ceilings, measure_ceilings
-from raytran.run.plan.forecast import PRECISIONS, Load, prediction_bytes, training_bytes, work_of_parts
+from raytran.run.plan.dry_run import PRECISIONS, Load, dry_prediction, dry_training
+from raytran.run.plan.roofline import Ceilings, measure_ceilings
 from raytran.run.train.build import build_model
 from raytran.training.stage import Stage
 
@@ -144,7 +146,9 @@ def _model(cfg: DictConfig) -> RayTran:
     cfg = cfg.copy()
     del cfg.model.grid
     cfg.model.grid_resolution, cfg.model.grid_extent = resolution, extent
-    return build_model(cfg, pretrained=False)
+    model = build_model(cfg, pretrained=False)
+    model.ray_tracer = RayTracer()  # whatever the config says: here rays are traced to be counted
+    return model
 
 
 def _device(gpu: str | None) -> tuple[str, int]:
@@ -161,10 +165,7 @@ def _pairs_per_pixel(cfg: DictConfig, model: RayTran, load: Load) -> float:
     views = load.views
     cameras = walk(views) if cfg.scene is None else recorded(Path(cfg.scene), views)
     grid = VoxelGrid(model.grid_resolution, model.grid_extent, cameras.position.mean(dim=0))
-    stride = model.backbone.stride
-    size = (load.image_size[0] // stride, load.image_size[1] // stride)
-    tracer = model.backbone.tracer or trace_pairs
-    pairs = tracer(cameras.scaled_to(load.image_size), grid, size, model.rays_per_cell)
+    pairs = listed(model.trace(cameras.scaled_to(load.image_size), grid))
     return len(pairs) / pairs.num_pixels
 
 
@@ -184,37 +185,27 @@ def _ceilings(cfg: DictConfig) -> Ceilings:
 
 def _training(model: RayTran, load: Load, stage: Stage, precision: str, ceilings: Ceilings) -> list[Need]:
     """Return what a training step needs, without and with activation checkpointing."""
-    parts = work_of_parts(model, load, training=True, precision=precision, stage=stage)
-    seconds = sum(work.seconds(*_both(ceilings)) for work in parts.values())
-    again = sum(
-        work.seconds(*_both(ceilings)) / 3 for name, work in parts.items() if "→" in name
-    )  # a third of a block's work is its forward pass
-    needs = []
     backbone = model.backbone
-    for repeat in dict.fromkeys((backbone.checkpoint_blocks, bool(backbone.blocks))):
+    if not isinstance(backbone, Backbone):
+        tally = dry_training(model, load, stage, precision=precision)
+        return [Need("train", "everything kept", load.views, _peak(tally.peak), tally.seconds(ceilings))]
+    needs = []
+    for repeat in dict.fromkeys((backbone.checkpoint_blocks, True)):
         backbone.checkpoint_blocks = repeat
-        used = _peak(training_bytes(model, load, stage, precision=precision))
+        tally = dry_training(model, load, stage, precision=precision)
         setting = f"model.backbone.checkpoint_blocks={str(repeat).lower()}"
-        if not backbone.blocks:
-            setting = "everything kept"
-        needs.append(Need("train", setting, load.views, used, seconds + (again if repeat else 0.0)))
+        needs.append(Need("train", setting, load.views, _peak(tally.peak), tally.seconds(ceilings)))
     return needs
 
 
 def _prediction(model: RayTran, load: Load, views_at_once: int | None, ceilings: Ceilings) -> list[Need]:
     """Return what a prediction in 32 bit needs, with all frames at once or with fewer."""
-    parts = work_of_parts(model, load, training=False)
-    seconds = sum(work.seconds(*_both(ceilings)) for work in parts.values())
     needs = []
     for count in dict.fromkeys((views_at_once, None, 16, 4)):
-        used = _peak(prediction_bytes(model, load, views_at_once=count))
+        tally = dry_prediction(model, load, views_at_once=count)
         setting = f"views_at_once={'null' if count is None else count}"
-        needs.append(Need("predict", setting, load.views, used, seconds))
+        needs.append(Need("predict", setting, load.views, _peak(tally.peak), tally.seconds(ceilings)))
     return needs
-
-
-def _both(ceilings: Ceilings) -> tuple[float, float]:
-    return ceilings.operations_per_second, ceilings.bytes_per_second
 
 
 def _peak(tensors: int) -> int:

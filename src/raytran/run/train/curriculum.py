@@ -9,7 +9,6 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from types import FrameType
 
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
@@ -19,7 +18,7 @@ from raytran.data.files import SettingsRecord
 from raytran.errors import ConfigError, RaytranError
 from raytran.run.entry import compose, quoted, typed_config_dir, user_environment
 from raytran.run.train.fit import FitResult, train
-from raytran.training.callbacks.stop_signals import SIGNALS
+from raytran.training.callbacks.stop_signals import forward_signals
 
 _log = logging.getLogger(__name__)
 
@@ -102,22 +101,18 @@ def _config_dir() -> list[str]:
 
 
 def _run(command: Sequence[str]) -> int:
-    """Run a command and return its exit code; pass signals to stop on to it, and stop after it."""
+    """Run a command and return its exit code; forward signals to it, and stop after it if one came."""
     stopped_by = 0
     with subprocess.Popen(command, env=user_environment()) as process:
 
-        def pass_on(signum: int, frame: FrameType | None) -> None:
+        def stop(signum: int) -> None:
             nonlocal stopped_by
             stopped_by = signum
             if signum != signal.SIGINT:  # Ctrl-C reaches all processes of a terminal
                 process.send_signal(signum)
 
-        earlier = {signum: signal.signal(signum, pass_on) for signum in SIGNALS}
-        try:
+        with forward_signals(stop):
             code = process.wait()
-        finally:
-            for signum, handler in earlier.items():
-                signal.signal(signum, handler)
     if stopped_by and code != 0:
         raise SystemExit(128 + stopped_by)
     return code

@@ -16,6 +16,7 @@ from torch.optim import Optimizer
 from raytran.errors import NonFiniteError
 from raytran.structs import RawObjects, SceneBatch
 from raytran.training.health_signals import RunningStatistics, gradient_norms, slot_signals
+from raytran.training.loggers import was_logged_step
 from raytran.training.ranks import mean_over_ranks
 from raytran.training.reconstruction import Reconstruction
 
@@ -100,7 +101,7 @@ class Health(pl.Callback):
             return
         if self._in_a_row:
             self._report_skipped(trainer)
-        if trainer.global_step % trainer.log_every_n_steps == 0:
+        if was_logged_step(trainer):
             pl_module.log_dict(self._signals(pl_module, outputs["objects"], batch))
         self._losses.clear()
 

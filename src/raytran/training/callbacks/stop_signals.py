@@ -6,6 +6,8 @@ from __future__ import annotations
 import logging
 import signal
 import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 import torch
@@ -14,6 +16,17 @@ import torch.distributed as dist
 _log = logging.getLogger(__name__)
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGUSR1)
+
+
+@contextmanager
+def forward_signals(stop: Callable[[int], None]) -> Iterator[None]:
+    """Hand signals that ask to stop to ``stop`` while the block runs, in a process that waits for others."""
+    before = {signum: signal.signal(signum, lambda number, _: stop(number)) for signum in SIGNALS}
+    try:
+        yield
+    finally:
+        for signum, handler in before.items():
+            signal.signal(signum, handler)
 
 
 class StopRequestedError(Exception):
@@ -31,8 +44,8 @@ class StopRequestedError(Exception):
 class StopSignals:
     """Listens for signals and lets all ranks agree on the step at which to obey them.
 
-    A signal may reach some of the ranks only, and each of them at another moment. So the ranks compare notes
-    between two batches, by processes and not by devices: no GPU is waited for.
+    A signal may reach some of the ranks only, and each of them at another moment. So the ranks ask each other
+    between two batches, over gloo: no GPU is waited for.
     """
 
     def __init__(self) -> None:
@@ -40,7 +53,10 @@ class StopSignals:
         self._group: dist.ProcessGroup | None = None
 
     def listen(self, world_size: int) -> None:
-        """Take the signals over; all ranks must call this together. Lightning gives them back at its end."""
+        """Handle the signals from now on; all ranks must call this together.
+
+        Lightning puts the earlier handlers back at the end of a fit.
+        """
         if world_size > 1:
             self._group = dist.new_group(backend="gloo")
         if threading.current_thread() is threading.main_thread():

@@ -13,6 +13,8 @@ import lightning.pytorch as pl
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 
+from raytran.training.loggers import was_logged_step
+
 _GB = 1e9
 _MAXRSS_UNIT = 1 if sys.platform == "darwin" else 1024
 
@@ -59,7 +61,7 @@ class Telemetry(pl.Callback):
             self._batches += 1
         self._ended = now
         ends_step = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
-        if ends_step and trainer.global_step % trainer.log_every_n_steps == 0:
+        if ends_step and was_logged_step(trainer):
             pl_module.log_dict(self._values(pl_module.device, trainer.accumulate_grad_batches))
             self._restart()
 
@@ -86,7 +88,8 @@ class RunSettings(pl.Callback):
 
     Args:
         settings: of the run, plain Python.
-        metric: name of a logged value, e.g. ``val/objects/accuracy_class``: its last one is the score; None: there is none.
+        metric: name of a logged value, e.g. ``val/objects/accuracy_class``, whose last one is the
+            score; None for no score.
     """
 
     def __init__(self, settings: Mapping[str, Any], *, metric: str | None) -> None:

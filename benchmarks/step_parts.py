@@ -2,7 +2,7 @@
 """The parts that a training step is made of, each on its own: to be counted, or to be measured.
 
 Their inputs are random features of the right sizes, so that no part waits for the one before. The same code
-runs on fake tensors (``run.count``) and on real ones (``benchmarks/step.py``).
+runs on fake tensors (``part_work.py``) and on real ones (``benchmarks/step.py``).
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ from typing import cast
 import torch
 from torch import Tensor
 
+from raytran.backbone.backbone import Backbone
 from raytran.backbone.block import RayTracedBlock, Stream
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
+from raytran.geometry.position import ray_code
 from raytran.model import TASKS, RayTran
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_attention import ray_attention
@@ -61,32 +63,37 @@ def step_parts(
     grid = VoxelGrid(model.grid_resolution, model.grid_extent, cameras.position.mean(dim=1))
     scenes, count = views.images.shape[:2]
     height, width = (side // backbone.stride for side in views.image_size)
-    with_pixels = "foreground" in tasks
 
     def features(*shape: int) -> Tensor:
-        like = backbone.projection.weight
+        like = backbone.voxel_norm.weight
         return torch.randn(*shape, dtype=like.dtype, device=like.device, requires_grad=model.training)
 
     voxels = features(scenes, *grid.resolution, backbone.channels)
     pixels = features(scenes * count, height, width, backbone.channels)
 
-    def trace() -> None:
-        tracer = backbone.tracer or model.ray_tracer
-        tracer(cameras, grid, (height, width), model.rays_per_cell)
+    def encode() -> Tensor:
+        found = backbone.image_features(views.images)
+        return (
+            found + backbone.ray_position(ray_code(cameras, grid, (height, width))) if has_blocks else found
+        )
 
+    def trace() -> None:
+        model.trace(cameras, grid)
+
+    has_blocks = isinstance(backbone, Backbone)
     parts = [
-        Part("encoder", 1, lambda: backbone.embed(views.images, cameras, grid)),
-        Part("traversal", 1, trace, "projection" if backbone.tracer else "traversal"),
+        Part("encoder", 1, encode),
+        Part("traversal", 1, trace, "traversal" if has_blocks else "projection"),
         Part("splat", 1, lambda: splat_features(pixels.flatten(0, 2), pairs)[0], "splat"),
     ]
-    if backbone.blocks:
+    if has_blocks:
         block, blocks = cast("RayTracedBlock", backbone.blocks[0]), len(backbone.blocks)
-        to_pixels = sum(backbone.updates_pixels(i, with_pixels=with_pixels) for i in range(blocks))
+        idle = backbone.idle_modules(with_pixels="foreground" in tasks)
+        to_pixels = blocks - sum(name.endswith(".pixel_stream") for name in idle)
         parts += _stream_parts("pixels → voxels", blocks, block.voxel_stream, voxels, pixels, pairs)
         parts += _stream_parts("voxels → pixels", to_pixels, block.pixel_stream, pixels, voxels, pairs)
     else:
-        start, seen = features(scenes * grid.num_voxels, backbone.channels), torch.ones(0)
-        parts.append(Part("3D convolutions", 1, lambda: backbone.start_voxels(start, seen, grid)))
+        parts.append(Part("3D convolutions", 1, lambda: backbone.voxel_network(voxels)))
     heads = {
         "occupancy": lambda: model.heads["occupancy"](voxels),
         "foreground": lambda: model.heads["foreground"](pixels.unflatten(0, (scenes, count))),
@@ -105,7 +112,10 @@ def _stream_parts(
 ) -> list[Part]:
     """Return the parts of one direction of a block."""
     query, key, value = (
-        stream.heads(x).detach().requires_grad_(x.requires_grad) for x in (target, source, source)
+        x.detach()
+        .reshape(-1, stream.num_heads, x.shape[-1] // stream.num_heads)
+        .requires_grad_(x.requires_grad)
+        for x in (target, source, source)
     )
 
     def project() -> Tensor:
@@ -125,8 +135,8 @@ def _stream_parts(
 
 def _all_layers(model: RayTran, voxels: Tensor, grid: VoxelGrid) -> Tensor:
     """Run the object head; return the sum of all that it says, so that all of it gets gradients."""
-    layers, proposals = model.heads["objects"](voxels, grid)
-    outputs = layers if proposals is None else (*layers, proposals)
+    found = model.heads["objects"](voxels, grid)
+    outputs = found.layers if found.proposals is None else (*found.layers, found.proposals)
     said = [getattr(output, name).sum() for output in outputs for name in _PREDICTED]
     return torch.stack(said).sum()
 

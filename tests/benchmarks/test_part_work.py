@@ -3,56 +3,28 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch import Tensor, nn
-from torch._subclasses.fake_tensor import FakeTensorMode
+from part_work import work_of_parts
+from step_parts import step_parts
+from torch import Tensor
 
 from raytran.geometry.grid import VoxelGrid
 from raytran.ops.traverse import trace_pairs
 from raytran.run.entry import compose
 from raytran.run.plan.camera_paths import walk
-from raytran.run.plan.count import Work, count_dense, count_part
-from raytran.run.plan.dry_run import fake_copy
-from raytran.run.plan.forecast import Load
-from raytran.run.plan.step_parts import step_parts
+from raytran.run.plan.dry_run import FakePairs, Load, dry_network
+from raytran.run.plan.roofline import Work
 from raytran.run.train.build import build_model
 from raytran.structs import Views
 
-
-def test_a_linear_layer_by_hand() -> None:
-    """3 rows, 4 → 8 channels: a product forward; one for each side's gradient and none for the bias."""
-    with FakeTensorMode():
-        layer, x = nn.Linear(4, 8), torch.empty(3, 4, requires_grad=True)
-        forward = count_dense(lambda: layer(x), training=False)
-        both = count_dense(lambda: layer(x))
-    assert forward.operations == 2 * 3 * 4 * 8
-    assert forward.bytes == 4 * (3 * 4 + 4 * 8 + 8 + 3 * 8)
-    assert both.operations == 3 * forward.operations
-    products = (3 * 8 + 8 * 4 + 3 * 4) + (3 * 8 + 3 * 4 + 4 * 8)
-    assert both.bytes == forward.bytes + 4 * products
-
-
-def test_what_lies_between_products_is_free() -> None:
-    with FakeTensorMode():
-        x = torch.empty(1000, requires_grad=True)
-        assert count_dense(lambda: nn.functional.gelu(x).exp()) == Work(0, 0)
-
-
-def test_work_adds_up_and_takes_the_higher_of_two_times() -> None:
-    work = Work(6.0, 2.0) + Work(2.0, 2.0) * 2
-    assert work == Work(10.0, 6.0)
-    assert work.seconds(10.0, 3.0) == 2.0
-    assert work.seconds(2.0, 3.0) == 5.0
+LOAD = Load(2, 6, (96, 128), pairs_per_pixel=30.0, fused=False)
 
 
 @pytest.fixture(scope="module")
 def counted() -> dict[str, Work]:
     model = build_model(compose("train", ["preset=tiny", "output_dir=x"]))
-    load = Load(2, 6, (96, 128), pairs_per_pixel=30.0, fused=False)
-    with FakeTensorMode():
-        network = fake_copy(model).train()
-        pairs = load.fake_pairs(network)
-        parts = step_parts(network, load.fake_views(3), pairs)
-        return {part.name: count_part(part, network, pairs, element_bytes=4) for part in parts}
+    # Of one block, so that every part runs once.
+    model.backbone.blocks = model.backbone.blocks[:1]
+    return work_of_parts(model, LOAD)
 
 
 def test_the_feed_forward_of_the_tiny_network_by_hand(counted: dict[str, Work]) -> None:
@@ -77,27 +49,22 @@ def test_every_part_costs_something(counted: dict[str, Work]) -> None:
 
 def test_the_convolutions_of_the_baseline_by_hand() -> None:
     model = build_model(compose("train", ["preset=tiny", "model/backbone=unprojection", "output_dir=x"]))
-    load = Load(2, 6, (96, 128), pairs_per_pixel=30.0, fused=False)
-    with FakeTensorMode():
-        network = fake_copy(model).eval().requires_grad_(False)
-        pairs = load.fake_pairs(network)
-        parts = {part.name: part for part in step_parts(network, load.fake_views(3), pairs)}
-        volume = count_part(parts["3D convolutions"], network, pairs, element_bytes=4, training=False)
-        assert count_part(parts["traversal"], network, pairs, element_bytes=4).bytes == 16 * len(pairs)
-    assert not any("→" in name for name in parts)
+    work = work_of_parts(model, LOAD)
+    assert not any("→" in name for name in work)
+    assert work["traversal"].bytes == 16 * 30 * 2 * 6 * 6 * 8
     voxels, channels = 2 * 24 * 24 * 12, 48
     finest = 2 * 2 * 27 * voxels  # two blocks of two convolutions
     down = (27 + 27 + 1) * (voxels / 8 + voxels / 64)
     up = 27 * (voxels / 8 + voxels / 64)  # a transposed convolution works on what comes in
-    assert volume.operations == 2 * channels**2 * (finest + down + up)
+    assert work["3D convolutions"].operations == 3 * 2 * channels**2 * (finest + down + up)
 
 
 def test_parts_leave_out_heads_that_do_not_run() -> None:
     model = build_model(compose("train", ["preset=tiny", "output_dir=x"]))
-    with FakeTensorMode():
-        network = fake_copy(model).train()
-        load = Load(1, 2, (32, 32), pairs_per_pixel=3.0, fused=False)
-        parts = step_parts(network, load.fake_views(3), load.fake_pairs(network), tasks=("occupancy",))
+    with dry_network(model, LOAD, "32-true") as (network, _):
+        network.train()
+        pairs = FakePairs.of(LOAD.scenes * LOAD.views * 6 * 8, 2 * 24 * 24 * 12, 3.0)
+        parts = step_parts(network, LOAD.fake_views(3), pairs, tasks=("occupancy",))
     times = {part.name: part.times for part in parts}
     assert "objects head" not in times
     assert "foreground head" not in times
