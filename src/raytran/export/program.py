@@ -94,16 +94,16 @@ class NetworkProgram(nn.Module):
         pairs = PairList(pixel_index, voxel_index, images.shape[0] * cells, grid.num_voxels)
         with_pixels = "foreground" in self.tasks
         voxels, pixels = backbone([images[None]], [cameras], grid, [pairs], with_pixels=with_pixels)
-        found = {}
+        outputs = {}
         if "occupancy" in self.tasks:
-            found["occupancy"] = heads["occupancy"](voxels)[0]
+            outputs["occupancy"] = heads["occupancy"](voxels)[0]
         if pixels is not None:
-            found["foreground"] = heads["foreground"](pixels[0])[0]
+            outputs["foreground"] = heads["foreground"](pixels[0])[0]
         if "objects" in self.tasks:
             last = heads["objects"](voxels, grid).layers[-1]
             of_queries = ("class_logits", "center", "log_size", "yaw_vector", "embedding")
-            found |= {name: getattr(last, name)[0] for name in of_queries}
-        return found
+            outputs |= {name: getattr(last, name)[0] for name in of_queries}
+        return outputs
 
 
 def example_inputs(model: RayTran, cameras: Cameras, *, seed: int = 0) -> tuple[Tensor, ...]:
