@@ -129,7 +129,7 @@ _NONE = _Choice(0.0, "", np.full((2, 3), np.nan))
 
 
 class _Cells(NamedTuple):
-    """A model's rank in the order of the search, packed cells and box; no cells and the reason if unusable."""
+    """A model's rank in the order of the search, packed cells and box; without cells, the reason."""
 
     rank: int
     name: str
