@@ -18,7 +18,7 @@ from torch import Tensor
 
 from raytran.data.shapenet.models import categories, model_names, read_facts, read_mesh, shapenet_version
 from raytran.data.shapenet.voxelize import voxelize_solid
-from raytran.data.targets import object_meshes
+from raytran.data.targets import cad_meshes
 from raytran.data.workers import work_on
 from raytran.errors import DataError
 from raytran.export.cad_alignments import align_cads
@@ -66,7 +66,7 @@ class NearestCads:
         """Return each object's CAD model, stretched into its box, in world coordinates, or None."""
         index = self._found()
         placed: list[trimesh.Trimesh | None] = [None] * len(self.objects)
-        meshes = object_meshes(self.objects.select(index), shapenet_root=self.root)
+        meshes = cad_meshes(self.objects.select(index), shapenet_root=self.root)
         for m, (vertices, faces) in zip(index.tolist(), meshes, strict=True):
             placed[m] = trimesh.Trimesh(vertices, faces, process=False)
         return placed
