@@ -12,6 +12,7 @@ from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
 from raytran.errors import ConfigError
+from raytran.postprocess import DUPLICATE_IOU, SCORE_THRESHOLD
 from raytran.rooms.generate import generate_rooms
 from raytran.run.entry import compose
 from raytran.run.train.build import build_model, plain
@@ -135,6 +136,13 @@ def test_the_papers_preset_is_the_default_of_the_code():
                         list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
                     )
                     assert node[name] == wanted, f"{node['_target_']}.{name}"
+
+
+@pytest.mark.parametrize("command", ["evaluate", "predict", "demo"])
+def test_commands_count_the_objects_that_the_code_counts(command):
+    typed = {"evaluate": [], "predict": ["scene=a", "output=b"], "demo": []}[command]
+    cfg = compose(command, typed)
+    assert (cfg.score_threshold, cfg.duplicate_iou) == (SCORE_THRESHOLD, DUPLICATE_IOU)
 
 
 def test_the_papers_numbers():

@@ -115,7 +115,7 @@ def foreground_masks(
     """
 
     def draw(missing: Cameras) -> NDArray[np.bool_]:
-        return rasterize_mask(object_meshes(objects, shapenet_root=shapenet_root), missing).numpy()
+        return rasterize_mask(cad_meshes(objects, shapenet_root=shapenet_root), missing).numpy()
 
     key = _scene_key(objects, shapenet_root)
     return _cached_per_camera("foreground", key, cameras, cameras.image_size, cache, draw)
@@ -152,7 +152,7 @@ def visible_masks(
     content = file_digest(scan_mesh)
 
     def draw(missing: Cameras) -> NDArray[np.bool_]:
-        meshes = object_meshes(objects, shapenet_root=shapenet_root)
+        meshes = cad_meshes(objects, shapenet_root=shapenet_root)
         scan = _scan_surface(scan_mesh, content)
         return rasterize_visible(meshes, [scan], missing, tolerance=MAX_SURFACE_OFFSET).numpy()
 
@@ -180,7 +180,7 @@ def seen_objects(objects: ObjectSet, cameras: Cameras, *, shapenet_root: Path, c
     """
 
     def draw(missing: Cameras) -> NDArray[np.bool_]:
-        ids, _ = rasterize_ids(object_meshes(objects, shapenet_root=shapenet_root), missing)
+        ids, _ = rasterize_ids(cad_meshes(objects, shapenet_root=shapenet_root), missing)
         seen = np.zeros((len(ids), len(objects)), dtype=bool)
         for is_seen, nearest in zip(seen, ids.numpy(), strict=True):
             is_seen[np.unique(nearest[nearest >= 0])] = True
@@ -235,7 +235,7 @@ def _scan_surface(path: Path, _content: str) -> tuple[NDArray, NDArray]:
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
-def object_meshes(objects: ObjectSet, *, shapenet_root: Path) -> list[tuple[NDArray, NDArray]]:
+def cad_meshes(objects: ObjectSet, *, shapenet_root: Path) -> list[tuple[NDArray, NDArray]]:
     """Return vertices ``(V, 3)`` in the world and faces ``(F, 3)`` of the CAD model of each of M objects.
 
     Raises:

@@ -108,11 +108,11 @@ def _box_edges(objects: ObjectSet, index: int) -> trimesh.Trimesh:
     vertices: list[NDArray[np.float64]] = []
     # An edge runs along one axis, at either end of the two others.
     for axis, *ends in product(range(3), (-0.5, 0.5), (-0.5, 0.5)):
-        place = np.insert(np.array(ends, dtype=np.float64), axis, 0.0)
-        thickness = _EDGE * (2 if place[2] < 0 else 1)
+        middle = np.insert(np.array(ends, dtype=np.float64), axis, 0.0)  # of the edge, in units of the box
+        thickness = _EDGE * (2 if middle[2] < 0 else 1)
         extents = np.full(3, thickness)
         extents[axis] += size[axis]
-        vertices.append(bar.vertices * extents + place * size)
+        vertices.append(bar.vertices * extents + middle * size)
     faces = [bar.faces + i * len(bar.vertices) for i in range(len(vertices))]
     corners = np.concatenate(vertices) @ rotation.T + center
     return trimesh.Trimesh(corners, np.concatenate(faces), process=False)

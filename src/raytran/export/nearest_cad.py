@@ -18,7 +18,7 @@ from torch import Tensor
 
 from raytran.data.shapenet.models import categories, model_names, read_facts, read_mesh, shapenet_version
 from raytran.data.shapenet.voxelize import voxelize_solid
-from raytran.data.targets import object_meshes
+from raytran.data.targets import cad_meshes
 from raytran.data.workers import work_on
 from raytran.errors import DataError
 from raytran.export.cad_alignments import align_cads
@@ -66,7 +66,7 @@ class NearestCads:
         """Return each object's CAD model, stretched into its box, in world coordinates, or None."""
         index = self._found()
         placed: list[trimesh.Trimesh | None] = [None] * len(self.objects)
-        meshes = object_meshes(self.objects.select(index), shapenet_root=self.root)
+        meshes = cad_meshes(self.objects.select(index), shapenet_root=self.root)
         for m, (vertices, faces) in zip(index.tolist(), meshes, strict=True):
             placed[m] = trimesh.Trimesh(vertices, faces, process=False)
         return placed
@@ -107,8 +107,8 @@ def nearest_cads(objects: ObjectSet, root: Path, *, processes: int = 0, progress
             items_each=_MODELS_PER_PROCESS,
             progress=progress,
         )
-        found = _best_of_class(objects.select(index), root, models, extents, search, left_out)
-        for m, choice in zip(index.tolist(), found, strict=True):
+        best = _best_of_class(objects.select(index), root, models, extents, search, left_out)
+        for m, choice in zip(index.tolist(), best, strict=True):
             choices[m] = choice
     _report(objects, choices, root, left_out)
     boxes = torch.from_numpy(np.array([choice.box for choice in choices]).reshape(-1, 2, 3))
@@ -129,9 +129,9 @@ _NONE = _Choice(0.0, "", np.full((2, 3), np.nan))
 
 
 class _Cells(NamedTuple):
-    """A model's place in the search, packed cells and box; no cells and the reason if it is no use."""
+    """A model's rank in the order of the search, packed cells and box; without cells, the reason."""
 
-    place: int
+    rank: int
     name: str
     cells: NDArray[np.uint8] | None
     box: NDArray[np.float64]
@@ -169,7 +169,7 @@ def _best_of_class(
     """Return the best of a class's models for each of its ``M`` objects.
 
     No fit exceeds the IoU of the boxes. Models are read in the order of the highest that they can reach,
-    until none that remains can be better than what is found.
+    until none that remains can be better than the best so far.
     """
     best = [_NONE] * len(objects)
     if not models:
@@ -185,11 +185,11 @@ def _best_of_class(
     jobs = list(enumerate(models[i] for i in order))
     waiting = np.ones(len(jobs) + 1, dtype=bool)
     for result in search(jobs, partial(_read_cells, root, side)):
-        waiting[result.place] = False
+        waiting[result.rank] = False
         if result.cells is None:
             left_out[result.name] = result.reason
         else:
-            fits = reach[result.place] * _shape_iou(shapes, result.cells, side)
+            fits = reach[result.rank] * _shape_iou(shapes, result.cells, side)
             for m, fit in enumerate(fits.tolist()):
                 # Results come in any order; of equals the first by name is taken.
                 if (fit, best[m].name) > (best[m].fit, result.name):
@@ -201,19 +201,19 @@ def _best_of_class(
 
 
 def _read_cells(root: Path, side: int, job: tuple[int, str]) -> _Cells:
-    place, name = job
+    rank, name = job
     try:
         mesh = read_mesh(root, *name.split("/"))
     except DataError as error:
-        return _Cells(place, name, None, _NONE.box, str(error))
+        return _Cells(rank, name, None, _NONE.box, str(error))
     # Only the vertices that faces use count, as in the annotation and in the shapes of training.
     used, faces = np.unique(mesh.faces, return_inverse=True)
     vertices = mesh.vertices[used]
     box = np.stack([vertices.min(axis=0), vertices.max(axis=0)])
     if not (box[1] > box[0]).all():
-        return _Cells(place, name, None, _NONE.box, f"{name} is flat and has no size to be stretched")
+        return _Cells(rank, name, None, _NONE.box, f"{name} is flat and has no size to be stretched")
     cells = np.packbits(voxelize_solid(vertices, faces.reshape(-1, 3), size=side))
-    return _Cells(place, name, cells, box, "")
+    return _Cells(rank, name, cells, box, "")
 
 
 def _shape_iou(shapes: NDArray[np.float32], cells: NDArray[np.uint8], side: int) -> Floats:
@@ -245,7 +245,7 @@ def _report(objects: ObjectSet, choices: Sequence[_Choice], root: Path, left_out
         }
     )
     missing = f"; {root} has no CAD model of class {', '.join(none)}" if none else ""
-    found = sum(bool(choice.name) for choice in choices)
-    _log.info("nearest CAD models: for %d of %d objects%s", found, len(choices), missing)
+    num_found = sum(bool(choice.name) for choice in choices)
+    _log.info("nearest CAD models: for %d of %d objects%s", num_found, len(choices), missing)
     if left_out:
         _log.warning("left out %d CAD models, e.g. %s", len(left_out), next(iter(left_out.values())))

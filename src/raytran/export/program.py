@@ -3,25 +3,46 @@
 
 It takes the pixel-voxel pairs as an input, as ``trace_pairs`` gives them. Ray-traced attention is written in
 torch's own operators, so that the program runs where raytran is not installed; or it stays an operator of
-raytran, which is several times faster and must be imported first.
+raytran, which is several times faster and must be imported first. A ``.pt2`` file has a page of JSON inside
+that says how to use it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from typing import cast
+import io
+import json
+import logging
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
+from raytran.checkpoints.file import write_whole
 from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.model import TASKS, RayTran
 from raytran.ops.pairs import PairList
+from raytran.structs import CLASSES
 
+_log = logging.getLogger(__name__)
+
+SUFFIX = ".pt2"
+FORMAT = "raytran.program/1"
+JSON = "raytran.json"
+"""The extra file in the archive: ``torch.export.load(path, extra_files={JSON: ""})`` fills it in."""
+
+PARTS = ("network", "shapes")
 OPERATORS = ("aten", "raytran")
+
+_OF_CHECKPOINT = ("preset", "stage", "global_step", "scores", "git_commit", "versions")
+"""What the JSON repeats of a checkpoint."""
+
+_TRACED = 3
+"""Views that a program is traced with; it takes any number from two on."""
 
 _RAYTRAN = torch.ops.raytran
 
@@ -73,16 +94,16 @@ class NetworkProgram(nn.Module):
         pairs = PairList(pixel_index, voxel_index, images.shape[0] * cells, grid.num_voxels)
         with_pixels = "foreground" in self.tasks
         voxels, pixels = backbone([images[None]], [cameras], grid, [pairs], with_pixels=with_pixels)
-        found = {}
+        outputs = {}
         if "occupancy" in self.tasks:
-            found["occupancy"] = heads["occupancy"](voxels)[0]
+            outputs["occupancy"] = heads["occupancy"](voxels)[0]
         if pixels is not None:
-            found["foreground"] = heads["foreground"](pixels[0])[0]
+            outputs["foreground"] = heads["foreground"](pixels[0])[0]
         if "objects" in self.tasks:
             last = heads["objects"](voxels, grid).layers[-1]
             of_queries = ("class_logits", "center", "log_size", "yaw_vector", "embedding")
-            found |= {name: getattr(last, name)[0] for name in of_queries}
-        return found
+            outputs |= {name: getattr(last, name)[0] for name in of_queries}
+        return outputs
 
 
 def example_inputs(model: RayTran, cameras: Cameras, *, seed: int = 0) -> tuple[Tensor, ...]:
@@ -194,3 +215,77 @@ def _rows(offsets: Tensor, like: Tensor) -> Tensor:
     """Return the row of each pair, ``(P,)``."""
     rows = torch.arange(offsets.shape[0] - 1, device=offsets.device)
     return torch.repeat_interleave(rows, offsets.diff(), output_size=like.shape[0])
+
+
+def export_program(
+    model: RayTran,
+    checkpoint: Mapping[str, Any],
+    output: Path,
+    *,
+    cameras: Cameras,
+    part: str,
+    tasks: Sequence[str],
+    operators: str,
+) -> None:
+    """Write a network, or its decoder of shapes, to a file that ``torch.export.load`` opens.
+
+    Args:
+        model: the network, on the CPU.
+        checkpoint: what ``read_checkpoint`` returned.
+        output: the file, which appears whole or not at all, once the program in it has been run.
+        cameras: at least five for images of the network's size; the program is traced with the first few and
+            tried on all of them, and nothing else of them is left in it.
+        part: ``network`` or ``shapes``.
+        tasks: heads of the network to run.
+        operators: ``aten`` or ``raytran``; see ``export_network``.
+
+    Raises:
+        ConfigError: a setting is unknown, or the network has no such head.
+        CheckpointError: the file cannot be written.
+    """
+    tasks = [tasks] if isinstance(tasks, str) else tasks  # program.tasks=objects
+    about: dict[str, Any] = {"format": FORMAT, "part": part}
+    num_tried = len(cameras.position)
+    module: nn.Module
+    if part == "shapes":
+        program, module = export_shapes(model), model.heads["shape"]
+        inputs: tuple[Tensor, ...] = (torch.randn(num_tried, model.backbone.channels),)
+    elif part == "network":
+        traced = Cameras(
+            cameras.intrinsics[:_TRACED], cameras.world_from_camera[:_TRACED], cameras.image_size
+        )
+        program = export_network(model, traced, tasks=tasks, operators=operators)
+        module = NetworkProgram(model, image_size=cameras.image_size, tasks=tasks)
+        inputs = example_inputs(model, cameras)
+        about |= {"operators": operators} | _geometry(model, cameras.image_size)
+    else:
+        raise ConfigError(f"unknown program.part={part}: choose one of {', '.join(PARTS)}")
+    about |= {name: checkpoint[name] for name in _OF_CHECKPOINT if name in checkpoint}
+    file = io.BytesIO()
+    torch.export.save(program, file, extra_files={JSON: json.dumps(about, indent=1)})
+    _try_program(file, module, inputs)
+    write_whole(output, file.getvalue())
+
+
+def _geometry(model: RayTran, image_size: tuple[int, int]) -> dict[str, Any]:
+    """Return what one must know to make the network's inputs and to read its outputs."""
+    stride = model.backbone.stride
+    return {
+        "image_size": list(image_size),
+        "feature_size": [side // stride for side in image_size],
+        "rays_per_cell": model.rays_per_cell,
+        "grid_resolution": list(model.grid_resolution),
+        "grid_extent": list(model.grid_extent),
+        "classes": [*CLASSES, "padding"],
+    }
+
+
+@torch.no_grad()
+def _try_program(file: io.BytesIO, module: nn.Module, inputs: tuple[Tensor, ...]) -> None:
+    """Run the program out of the file on other sizes than it was traced with; say how near it comes."""
+    program: ExportedProgram = torch.export.load(file)
+    expected, computed = module(*inputs), program.module()(*inputs)
+    if isinstance(expected, Tensor):
+        expected, computed = {"": expected}, {"": computed}
+    apart = max((expected[name] - computed[name]).abs().max().item() for name in expected)
+    _log.info("the program's outputs differ from the network's by at most %.1g (made-up input)", apart)

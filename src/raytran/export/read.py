@@ -184,18 +184,18 @@ def _line_of_object(path: Path, index: int) -> int:
 
 def _from_alignments(path: Path, cads: CadAlignments, cad_boxes: CadBoxes) -> ScenePredictions:
     """Turn CAD alignments into boxes, as far as the CAD models are known."""
-    known = torch.tensor([i for i, name in enumerate(cads.model_id) if name in cad_boxes], dtype=torch.int64)
-    chosen = cads.select(known)
-    rotation = matrix_from_quaternion(chosen.quaternion)
-    center, half = _lookup(chosen.model_id, cad_boxes)
+    index = torch.tensor([i for i, name in enumerate(cads.model_id) if name in cad_boxes], dtype=torch.int64)
+    known = cads.select(index)
+    rotation = matrix_from_quaternion(known.quaternion)
+    center, half = _lookup(known.model_id, cad_boxes)
     objects = ObjectSet(
-        label=torch.tensor([CLASSES.index(name) for name in chosen.category], dtype=torch.int64),
-        center=chosen.translation + (rotation @ (chosen.scale * center)[..., None])[..., 0],
-        size=(2 * half * chosen.scale).clamp(min=_THINNEST),
+        label=torch.tensor([CLASSES.index(name) for name in known.category], dtype=torch.int64),
+        center=known.translation + (rotation @ (known.scale * center)[..., None])[..., 0],
+        size=(2 * half * known.scale).clamp(min=_THINNEST),
         rotation=rotation,
-        symmetry=torch.ones(len(chosen), dtype=torch.int64),
-        score=chosen.score,
-        model_id=chosen.model_id,
+        symmetry=torch.ones(len(known), dtype=torch.int64),
+        score=known.score,
+        model_id=known.model_id,
     )
     return ScenePredictions(path, objects, cads, cads, n_unknown_cads=len(cads) - len(known))
 
@@ -206,12 +206,13 @@ def _from_objects(path: Path, objects: ObjectSet, cad_boxes: CadBoxes) -> SceneP
     known = [name in cad_boxes and bool((cad_boxes[name][1] > 0).all()) for name in names]
     center, half = _lookup([name if ok else "" for name, ok in zip(names, known, strict=True)], cad_boxes)
     catid_of = {category: catid for catid, category in CLASS_BY_CATID.items()}
-    parts = [name.partition("/") for name in names]
+    split_names = [name.partition("/") for name in names]
     catids = [
-        part[0] or catid_of.get(CLASSES[label], "")
-        for part, label in zip(parts, objects.label.tolist(), strict=True)
+        catid or catid_of.get(CLASSES[label], "")
+        for (catid, _, _), label in zip(split_names, objects.label.tolist(), strict=True)
     ]
-    boxes = align_cads(objects, catids, [part[2] for part in parts], center=center, half_extent=half)
+    id_cads = [id_cad for _, _, id_cad in split_names]
+    boxes = align_cads(objects, catids, id_cads, center=center, half_extent=half)
     complete = all(names)
     index = torch.tensor(known, dtype=torch.bool).nonzero().squeeze(1)
     cads = replace(boxes.select(index), half_extent=None) if complete else None

@@ -197,9 +197,9 @@ def write_occupancy(
         ``path``.
     """
     x, y, z = occupancy.shape
-    chosen = (occupancy > _OCCUPIED).cpu()
-    centers = VoxelGrid((x, y, z), extent, center.double().cpu()).voxel_centers()[chosen].numpy()
-    probability = occupancy.double().cpu()[chosen].numpy()
+    is_occupied = (occupancy > _OCCUPIED).cpu()
+    centers = VoxelGrid((x, y, z), extent, center.double().cpu()).voxel_centers()[is_occupied].numpy()
+    probability = occupancy.double().cpu()[is_occupied].numpy()
     colors = colormaps["viridis"]((probability - _OCCUPIED) / (1 - _OCCUPIED), bytes=True)
     points = np.empty(len(centers), dtype=[(name, kind) for name, (kind, _) in _PROPERTIES.items()])
     columns = (*centers.T, *colors[:, :3].T, probability)

@@ -68,8 +68,8 @@ class AccuracyCurves(ObjectMetric):
         errors = torch.stack([*alignment_errors(predictions, targets)]).numpy()
         same_class = (predictions.label[:, None] == targets.label).numpy()
         within = (errors <= self._limits[:, :, None, None]).all(axis=1)
-        found = _first_fit(same_class & within, score_order(predictions.score).tolist())
-        truths = torch.cat([targets.label[:, None].double(), torch.from_numpy(found.T).double()], dim=1)
+        is_found = _first_fit(same_class & within, score_order(predictions.score).tolist())
+        truths = torch.cat([targets.label[:, None].double(), torch.from_numpy(is_found.T).double()], dim=1)
         return truths, predictions.label[:, None].double()
 
     def compute(self) -> dict[str, CurveResult]:
@@ -83,12 +83,12 @@ class AccuracyCurves(ObjectMetric):
         global_average = good.sum(dim=1) / total.sum().clamp(min=1)
         curves: dict[str, CurveResult] = {}
         for index, curve in enumerate(CURVES):
-            part = slice(index * len(FACTORS), (index + 1) * len(FACTORS))
+            points = slice(index * len(FACTORS), (index + 1) * len(FACTORS))
             unit = 1.0 if curve.name == "joint" else SCAN2CAD_LIMITS[index]
             curves[curve.name] = CurveResult(
                 threshold=[_scaled(unit, factor) for factor in FACTORS],
-                class_average=class_average[part].tolist(),
-                global_average=global_average[part].tolist(),
+                class_average=class_average[points].tolist(),
+                global_average=global_average[points].tolist(),
             )
         return curves
 
@@ -122,14 +122,14 @@ def accuracy_by_scene_size(rows: Iterable[Row], sizes: Sequence[int] = SCENE_SIZ
     size_of = Counter(row["scene_id"] for row in table)
     result: dict[str, Any] = {}
     for size in sizes:
-        chosen = [row for row in table if size_of[row["scene_id"]] <= size]
-        total = Counter(row["category"] for row in chosen)
-        good = Counter(row["category"] for row in chosen if row["matched"])
+        in_small = [row for row in table if size_of[row["scene_id"]] <= size]
+        total = Counter(row["category"] for row in in_small)
+        good = Counter(row["category"] for row in in_small if row["matched"])
         result[str(size)] = {
             "class_average": sum(good[name] / count for name, count in total.items()) / max(len(total), 1),
-            "global_average": good.total() / max(len(chosen), 1),
+            "global_average": good.total() / max(len(in_small), 1),
             "n_good": good.total(),
-            "n_total": len(chosen),
+            "n_total": len(in_small),
             "n_scenes": sum(count <= size for count in size_of.values()),
         }
     return result
@@ -152,11 +152,11 @@ def _scaled(limit: float, factor: float) -> float:
 
 
 def _first_fit(allowed: NDArray[np.bool_], order: Sequence[int]) -> NDArray[np.bool_]:
-    """Give each prediction in turn the first free object it may take, at all thresholds at once.
+    """Give each prediction, one after another, the first free object it may take; at all thresholds at once.
 
     Args:
         allowed: ``(T, P, M)``, whether a prediction may take an object at a threshold.
-        order: the turn of the predictions.
+        order: the predictions in the order in which they choose.
 
     Returns:
         ``(T, M)``, whether an object is taken.

@@ -52,9 +52,10 @@ class OrientedBoxF1(ProtocolMetric):
     """Precision, recall and F1 of predicted boxes, pooled over all classes and scenes.
 
     Protocol ``strict``, which compares ``ObjectSet``s: exact IoU of the oriented boxes; all nine classes,
-    matched by name; predictions take their turn by score, and each takes the free object of highest IoU if
-    that is *above* the threshold, so that matching is one to one; every scene counts. All predictions given
-    count; ``best`` tells what is reached when those below one score, chosen to maximise F1, are left out.
+    matched by name; predictions choose in the order of their scores, and each takes the free object of
+    highest IoU if that is *above* the threshold, so that matching is one to one; every scene counts. All
+    predictions given count; ``best`` tells what is reached when those below one score, chosen to maximise F1,
+    are left out.
 
     Protocol ``odam`` gives the counts of ODAM's script and compares ``CadAlignments``: boxes on the CAD's
     origin and their overlap seen from above times that of the heights (``functional.odam``); the eight
@@ -99,8 +100,8 @@ class OrientedBoxF1(ProtocolMetric):
 
     def judge_cads(self, predictions: CadAlignments, targets: CadAlignments) -> tuple[Tensor, Tensor]:
         """Match by CAD alignments."""
-        known = cad_half_extents([targets]) if self.cad_half_extents is None else self.cad_half_extents
-        predicted_corners, predictions = odam_predicted_boxes(predictions, known)
+        half_extents = cad_half_extents([targets]) if self.cad_half_extents is None else self.cad_half_extents
+        predicted_corners, predictions = odam_predicted_boxes(predictions, half_extents)
         true_corners, counted = odam_true_boxes(targets)
         label, true_label = _labels(predictions), _labels(targets)[counted]
         iou = bev_iou(predicted_corners, true_corners)
@@ -125,10 +126,8 @@ class OrientedBoxF1(ProtocolMetric):
         iou = torch.where(predictions.label[:, None] == targets.label, iou, 0.0)
         order = score_order(predictions.score)
         best = torch.cat([iou, iou.new_zeros(1, len(targets))]).amax(dim=0)
-        truths, taken = (
-            [targets.label.double(), best],
-            [predictions.label.double(), predictions.score.nan_to_num(nan=-torch.inf)],
-        )
+        truths = [targets.label.double(), best]
+        taken = [predictions.label.double(), predictions.score.nan_to_num(nan=-torch.inf)]
         for threshold in self.iou_thresholds:
             match = match_in_order(order, iou > threshold, preference=iou)
             taken.append((match >= 0).double())

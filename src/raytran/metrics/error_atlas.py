@@ -96,10 +96,11 @@ class ErrorAtlas(ObjectMetric):
         fits = same_class & errors.within(*SCAN2CAD_LIMITS)
         match = match_in_order(score_order(predictions.score), fits)
         free = match < 0
-        found = torch.zeros(len(targets), dtype=torch.bool).index_fill(0, match[~free], True)
+        is_found = torch.zeros(len(targets), dtype=torch.bool).index_fill(0, match[~free], True)
         reach = (targets.size.norm(dim=-1) / 2).clamp(min=SCAN2CAD_LIMITS[0])
         near = errors.translation <= reach
 
+        # Causes are set from the last to the first, so that the first that holds stays.
         excess = torch.stack([error / limit for error, limit in zip(errors, SCAN2CAD_LIMITS, strict=True)])
         worst, which = excess.max(dim=0)
         cause = torch.full((len(targets),), CAUSES.index("missed"))
@@ -111,7 +112,7 @@ class ErrorAtlas(ObjectMetric):
             cause = torch.where(candidates.any(dim=0), limit, cause)
         cause[fits.any(dim=0)] = CAUSES.index("duplicate")
         cause[self._outside(targets.center)] = CAUSES.index("outside the volume")
-        cause[found] = CAUSES.index("found")
+        cause[is_found] = CAUSES.index("found")
 
         fate = torch.full((len(predictions),), FATES.index("background"))
         fate[near.any(dim=1)] = FATES.index("wrong class")

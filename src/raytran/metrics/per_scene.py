@@ -136,8 +136,8 @@ class ObjectMetric(SceneMetric):
         for predicted, target, scene_id in zip(predictions, targets, scene_ids, strict=True):
             if predicted is None and self.drops_missing:
                 continue
-            found = type(target).empty() if predicted is None else predicted
-            tables = self.judge(*(self._in_float64(objects) for objects in (found, target)))
+            objects = type(target).empty() if predicted is None else predicted
+            tables = self.judge(self._in_float64(objects), self._in_float64(target))
             self.add(SceneRecord(scene_id, *tables))
 
     def predictions(self) -> Tensor:

@@ -54,7 +54,7 @@ class Scan2CADAccuracy(ProtocolMetric):
     It is a recall: predictions too many cost nothing. Protocol ``strict``, which compares ``ObjectSet``s:
 
     - every scene counts, also one without predictions; all nine classes, matched by name;
-    - predictions take their turn by score, and each takes the first annotated object still free that it fits;
+    - predictions choose by score, and each takes the first annotated object still free that it fits;
     - translation is the distance of the box centres; size error is ``|mean(size / true size) - 1|``;
     - rotation is the full angle, the least over the annotated object's symmetry;
     - no cap on the number of predictions and no removal of duplicates.
@@ -111,16 +111,17 @@ class Scan2CADAccuracy(ProtocolMetric):
         errors = alignment_errors(predictions, targets)
         same_class = predictions.label[:, None] == targets.label
         match = match_in_order(score_order(predictions.score), same_class & errors.within(*self.limits))
-        found = torch.stack([predictions.label.double(), predictions.score, (match >= 0).double()], dim=-1)
-        return _truths(targets.label, errors, same_class, match, predictions.score), found
+        truths = _truths(targets.label, errors, same_class, match, predictions.score)
+        label = predictions.label.double()
+        return truths, torch.stack([label, predictions.score, (match >= 0).double()], dim=-1)
 
     def judge_cads(self, predictions: CadAlignments, targets: CadAlignments) -> tuple[Tensor, Tensor]:
         """Match by CAD alignments."""
         if self.protocol == "vid2cad":
             errors, match = match_vid2cad(predictions, targets, self.limits)
         else:
-            known = cad_symmetries([targets]) if self.cad_symmetries is None else self.cad_symmetries
-            errors, match = match_scan2cad(predictions, targets, known, self.limits)
+            symmetries = cad_symmetries([targets]) if self.cad_symmetries is None else self.cad_symmetries
+            errors, match = match_scan2cad(predictions, targets, symmetries, self.limits)
         same_class = equal_names(predictions.catid, targets.catid)
         truths = _truths(self._labels(targets), errors, same_class, match, predictions.score)
         label = self._labels(predictions).double()
@@ -137,9 +138,9 @@ class Scan2CADAccuracy(ProtocolMetric):
         """Return the accuracy of each class, the mean over those that occur, and that of all objects."""
         scenes = self.scenes()
         truths = self._counted(scenes)
-        label, found = truths[:, 0].long(), truths[:, 1] == 1
+        label, is_found = truths[:, 0].long(), truths[:, 1] == 1
         total = torch.bincount(label, minlength=len(self.class_names)).tolist()
-        good = torch.bincount(label[found], minlength=len(self.class_names)).tolist()
+        good = torch.bincount(label[is_found], minlength=len(self.class_names)).tolist()
         per_class = {
             name: ClassAccuracy(n_good=n_good, n_total=n_total, accuracy=self._accuracy(n_good, n_total))
             for name, n_good, n_total in zip(self.class_names, good, total, strict=True)
@@ -162,10 +163,12 @@ class Scan2CADAccuracy(ProtocolMetric):
         """Return the rows of the objects that count."""
         truths = self.truths()
         if self.protocol == "vid2cad":
-            known = {
+            predicted_labels = {
                 label for scene in scenes if len(scene.predictions) for label in scene.truths[:, 0].tolist()
             }
-            truths = truths[torch.isin(truths[:, 0], torch.tensor(sorted(known), dtype=truths.dtype))]
+            truths = truths[
+                torch.isin(truths[:, 0], torch.tensor(sorted(predicted_labels), dtype=truths.dtype))
+            ]
         return truths[truths[:, 0] >= 0]
 
     def _accuracy(self, n_good: int, n_total: int) -> float:
@@ -175,7 +178,7 @@ class Scan2CADAccuracy(ProtocolMetric):
     def object_rows(self, record: SceneRecord) -> list[Row]:
         """Return whether each object is found, and the errors of its prediction or else of the nearest."""
         rows: list[Row] = []
-        for index, (label, found, *values) in enumerate(record.truths.tolist()):
+        for index, (label, is_found, *values) in enumerate(record.truths.tolist()):
             if label < 0:
                 continue
             translation, rotation, scale, score = (None if value != value else value for value in values)
@@ -185,7 +188,7 @@ class Scan2CADAccuracy(ProtocolMetric):
                 "category": self.class_names[int(label)],
             }
             row |= {
-                "matched": bool(found),
+                "matched": bool(is_found),
                 "translation_error_m": translation,
                 "rotation_error_deg": rotation,
             }

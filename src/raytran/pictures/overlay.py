@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -51,16 +51,29 @@ def draw_overlays(
     """
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
-    for n in dict.fromkeys(choose_even(len(frame_ids), min(count, len(frame_ids))).tolist()):
+    for frame, picture in overlays(views, prediction.objects, meshes, count=count, min_height=min_height):
+        paths.append(folder / f"{frame_ids[frame]}.jpg")
+        picture.save(paths[-1], quality=92)
+    return paths
+
+
+def overlays(
+    views: Views,
+    objects: ObjectSet,
+    meshes: Sequence[trimesh.Trimesh | None],
+    *,
+    count: int,
+    min_height: int,
+) -> Iterator[tuple[int, Image.Image]]:
+    """Yield a few frames with the objects drawn over them, each with its index; see ``draw_overlays``."""
+    num_frames, cameras = views.images.shape[1], Cameras.of(views.scene())
+    for n in dict.fromkeys(choose_even(num_frames, min(count, num_frames)).tolist()):
         frame = frame_image(views, n)
-        camera = Cameras(views.intrinsics[0, n], views.world_from_camera[0, n], views.image_size)
+        camera = Cameras(cameras.intrinsics[n], cameras.world_from_camera[n], cameras.image_size)
         if frame.height < min_height:
             size = (min_height, round(frame.width * min_height / frame.height))
             frame, camera = frame.resize(size[::-1], Image.Resampling.BICUBIC), camera.scaled_to(size)
-        picture = draw_objects(frame, camera, prediction.objects, meshes)
-        paths.append(folder / f"{frame_ids[n]}.jpg")
-        picture.save(paths[-1], quality=92)
-    return paths
+        yield n, draw_objects(frame, camera, objects, meshes)
 
 
 def frame_image(views: Views, index: int) -> Image.Image:

@@ -5,9 +5,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from raytran.data.views import choose_even
 from raytran.geometry.camera import Cameras
-from raytran.pictures.overlay import draw_objects, frame_image
+from raytran.pictures.overlay import overlays
 from raytran.pictures.panels import contact_sheet, draw_masks, draw_new_views, draw_occupancy
 from raytran.pictures.topdown import draw_topdown
 from raytran.postprocess import object_meshes
@@ -54,13 +53,11 @@ def draw_scene(
             path, batch.views, batch.new_views, prediction.new_views, count=_FRAMES
         )
     if batch.objects is not None:
-        views = batch.views
-        cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], views.image_size)
         pictures["topdown"] = draw_topdown(
             folder / "topdown.png",
             prediction,
             truth=batch.objects[0],
-            cameras=cameras,
+            cameras=Cameras.of(batch.views.scene()),
             grid_extent=grid_extent,
         )
         pictures["boxes"] = _draw_boxes(folder / "boxes.jpg", batch, prediction)
@@ -68,18 +65,9 @@ def draw_scene(
 
 
 def _draw_boxes(path: Path, batch: SceneBatch, prediction: ScenePrediction) -> Path:
-    views = batch.views
     meshes = [
         mesh if mesh is not None and len(mesh.faces) <= _MAX_FACES else None
         for mesh in object_meshes(prediction)
     ]
-    count = views.images.shape[1]
-    tiles = []
-    for n in choose_even(count, min(_FRAMES, count)).tolist():
-        frame = frame_image(views, n)
-        camera = Cameras(views.intrinsics[0, n], views.world_from_camera[0, n], views.image_size)
-        if frame.height < _MIN_HEIGHT:
-            size = (_MIN_HEIGHT, round(frame.width * _MIN_HEIGHT / frame.height))
-            frame, camera = frame.resize(size[::-1]), camera.scaled_to(size)
-        tiles.append(draw_objects(frame, camera, prediction.objects, meshes))
-    return contact_sheet(path, tiles, columns=2)
+    frames = overlays(batch.views, prediction.objects, meshes, count=_FRAMES, min_height=_MIN_HEIGHT)
+    return contact_sheet(path, [picture for _, picture in frames], columns=2)

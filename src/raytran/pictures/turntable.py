@@ -143,10 +143,10 @@ def _solid(ids: Tensor, depth: Tensor, rays: Tensor, colors: NDArray[np.float32]
         # Only the part with meshes is lit.
         top, left = (int(covered.any(dim=axis).nonzero()[0]) for axis in (1, 0))
         bottom, right = (int(covered.any(dim=axis).nonzero()[-1]) + 1 for axis in (1, 0))
-        part = (slice(max(top - 1, 0), bottom + 1), slice(max(left - 1, 0), right + 1))
-        inside = covered[part]
-        light = headlight(depth[part], rays[part])[inside].numpy()[:, None]
-        picture[part][inside.numpy()] = (colors[ids[part][inside].numpy()] * light).clip(0, 255).round()
+        window = (slice(max(top - 1, 0), bottom + 1), slice(max(left - 1, 0), right + 1))
+        inside = covered[window]
+        light = headlight(depth[window], rays[window])[inside].numpy()[:, None]
+        picture[window][inside.numpy()] = (colors[ids[window][inside].numpy()] * light).clip(0, 255).round()
     return picture
 
 

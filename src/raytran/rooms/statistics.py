@@ -15,7 +15,7 @@ from torch import Tensor
 from raytran.data.scan2cad import SceneAnnotation, read_annotations, scene_objects
 from raytran.data.scannet.scan import read_scan
 from raytran.data.scene_list import read_split
-from raytran.data.targets import object_meshes
+from raytran.data.targets import cad_meshes
 from raytran.data.views import choose_even
 from raytran.geometry.camera import Cameras
 from raytran.geometry.rasterize import rasterize_ids, rasterize_mask
@@ -88,7 +88,7 @@ def look(objects: ObjectSet, cameras: Cameras, *, shapenet_root: Path) -> Sight:
     """
     height, width = cameras.image_size
     small = cameras.scaled_to((_ROWS, round(_ROWS * width / height)))
-    meshes = object_meshes(objects, shapenet_root=shapenet_root)
+    meshes = cad_meshes(objects, shapenet_root=shapenet_root)
     nearest, _ = rasterize_ids(meshes, small)
     outline = [rasterize_mask([mesh], small).sum(dim=(1, 2)) for mesh in meshes]
     visible = [(nearest == m).sum(dim=(1, 2)) for m in range(len(meshes))]

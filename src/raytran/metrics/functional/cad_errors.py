@@ -59,9 +59,11 @@ def comb_rotation_error(predicted: Tensor, target: Tensor, symmetry: Tensor) -> 
     step = torch.arange(_COMB, device=target.device)
     half = step.to(target.dtype) * (math.pi / _COMB)
     cos, sin = torch.cos(half), torch.sin(half)
-    w, x, y, z = (part[:, None] for part in target.unbind(dim=-1))
-    turned = torch.stack([w * cos - y * sin, x * cos - z * sin, y * cos + w * sin, z * cos + x * sin], dim=-1)
-    overlap = (predicted[:, None, None] * turned).sum(dim=-1).abs()
+    w, x, y, z = (column[:, None] for column in target.unbind(dim=-1))
+    rotated = torch.stack(
+        [w * cos - y * sin, x * cos - z * sin, y * cos + w * sin, z * cos + x * sin], dim=-1
+    )
+    overlap = (predicted[:, None, None] * rotated).sum(dim=-1).abs()
     angle = torch.rad2deg(2 * torch.acos(overlap))
     angle = torch.where(overlap > 1, 0.0, angle)
     count = torch.where(symmetry == SYMMETRY_INFINITE, _COMB, symmetry)[..., None]
@@ -85,12 +87,12 @@ def cad_symmetries(truths: Iterable[CadAlignments]) -> dict[str, int]:
     Raises:
         ValueError: a scene has no symmetries: it holds predictions.
     """
-    found: dict[str, int] = {}
+    symmetries: dict[str, int] = {}
     for truth in truths:
         if truth.symmetry is None:
             raise ValueError("expected annotated scenes, which have symmetries")
-        found.update(zip(truth.model_id, truth.symmetry.tolist(), strict=True))
-    return found
+        symmetries.update(zip(truth.model_id, truth.symmetry.tolist(), strict=True))
+    return symmetries
 
 
 def cad_half_extents(truths: Iterable[CadAlignments]) -> dict[str, list[float]]:
@@ -102,9 +104,9 @@ def cad_half_extents(truths: Iterable[CadAlignments]) -> dict[str, list[float]]:
     Raises:
         ValueError: a scene has no boxes: it holds predictions.
     """
-    found: dict[str, list[float]] = {}
+    half_extents: dict[str, list[float]] = {}
     for truth in truths:
         if truth.half_extent is None:
             raise ValueError("expected annotated scenes, which have boxes")
-        found.update(zip(truth.model_id, truth.half_extent.tolist(), strict=True))
-    return found
+        half_extents.update(zip(truth.model_id, truth.half_extent.tolist(), strict=True))
+    return half_extents

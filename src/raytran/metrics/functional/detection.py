@@ -32,10 +32,10 @@ def score_order(score: Tensor) -> Tensor:
 
 
 def match_in_order(order: Tensor, allowed: Tensor, preference: Tensor | None = None) -> Tensor:
-    """Give each prediction in turn one true object that is still free.
+    """Give each prediction, one after another, one true object that is still free.
 
     Args:
-        order: ``(P,)`` int64, the turn of the predictions.
+        order: ``(P,)`` int64, the predictions in the order in which they choose.
         allowed: ``(P, M)`` bool, whether a prediction may take an object.
         preference: ``(P, M)``; a prediction takes the free object that it prefers most, the first among
             equals. None: the first free object.
@@ -44,13 +44,13 @@ def match_in_order(order: Tensor, allowed: Tensor, preference: Tensor | None = N
         ``(P,)`` int64, the object of each prediction, or -1.
     """
     match = torch.full((allowed.shape[0],), -1, dtype=torch.int64, device=allowed.device)
-    wish = allowed.double() if preference is None else preference.double()
-    wish = torch.where(allowed, wish, -torch.inf)
+    remaining = allowed.double() if preference is None else preference.double()
+    remaining = torch.where(allowed, remaining, -torch.inf)
     for index in order[allowed[order].any(dim=1)].tolist():
-        best, choice = wish[index].max(dim=0)  # the first of equals
+        best, choice = remaining[index].max(dim=0)  # the first of equals
         if best > -torch.inf:
             match[index] = choice
-            wish[:, choice] = -torch.inf
+            remaining[:, choice] = -torch.inf  # taken
     return match
 
 
@@ -85,8 +85,8 @@ def best_f1(score: Tensor, matched: Tensor, n_true: int) -> BestScores:
         return BestScores(score_threshold=0.0, **detection_scores(0, 0, n_true))
     level, n_matched, n_predicted = _running_counts(score, matched)
     best = int((2 * n_matched.double() / (n_predicted + n_true)).argmax())  # the first of equals
-    chosen = detection_scores(int(n_matched[best]), int(n_predicted[best]), n_true)
-    return BestScores(score_threshold=float(level[best]), **chosen)
+    scores = detection_scores(int(n_matched[best]), int(n_predicted[best]), n_true)
+    return BestScores(score_threshold=float(level[best]), **scores)
 
 
 def average_precision(score: Tensor, matched: Tensor, n_true: int) -> float:

@@ -57,14 +57,14 @@ def odam_predicted_boxes(
     Returns:
         ``(P', 8, 3)`` in the scan, metres, and the P' alignments.
     """
-    chosen = predictions.select(_named(predictions))
-    half = chosen.half_extent
+    counted = predictions.select(_named(predictions))
+    half = counted.half_extent
     if half is None:
         unknown = (torch.nan, torch.nan, torch.nan)
-        rows = [tuple(half_extents.get(name, unknown)) for name in chosen.model_id]
-        half = torch.tensor(rows, dtype=torch.float64).reshape(len(chosen), 3)
-    rotation = matrix_from_quaternion(chosen.quaternion)
-    return _corners(rotation, chosen.translation, half * chosen.scale), chosen
+        rows = [tuple(half_extents.get(name, unknown)) for name in counted.model_id]
+        half = torch.tensor(rows, dtype=torch.float64).reshape(len(counted), 3)
+    rotation = matrix_from_quaternion(counted.quaternion)
+    return _corners(rotation, counted.translation, half * counted.scale), counted
 
 
 def bev_iou(first: Tensor, second: Tensor) -> Tensor:

@@ -49,17 +49,17 @@ def match_vid2cad(
     if targets.symmetry is None:
         raise ShapeError("protocol vid2cad needs the symmetry of the annotated models")
     rounded = _in_float32(predictions)
-    known: dict[str, int] = {}
+    symmetry_of: dict[str, int] = {}
     for name, value in zip(targets.model_id, targets.symmetry.tolist(), strict=True):
-        known.setdefault(name, value)
-    symmetry = torch.tensor([known.get(name, 1) for name in rounded.model_id], dtype=torch.int64)
+        symmetry_of.setdefault(name, value)
+    symmetry = torch.tensor([symmetry_of.get(name, 1) for name in rounded.model_id], dtype=torch.int64)
     shared = torch.where(symmetry[:, None] == targets.symmetry, targets.symmetry, 1)
     errors = cad_errors(rounded, targets, targets.translation, shared, torch.float32)
     order = rounded.score.argsort(descending=True, stable=True)
-    kept = _kept(rounded.select(order), symmetry[order], Counter(targets.catid))
+    counts = _counts(rounded.select(order), symmetry[order], Counter(targets.catid))
     named = torch.tensor([catid in VID2CAD_CLASS_BY_CATID for catid in targets.catid], dtype=torch.bool)
     fits = equal_names(rounded.catid, targets.catid) & named & errors.within(*limits)
-    return errors, match_in_order(order[kept], fits)
+    return errors, match_in_order(order[counts], fits)
 
 
 def _in_float32(alignments: CadAlignments) -> CadAlignments:
@@ -68,7 +68,7 @@ def _in_float32(alignments: CadAlignments) -> CadAlignments:
     return replace(alignments, **{name: getattr(alignments, name).float().double() for name in names})
 
 
-def _kept(ranked: CadAlignments, symmetry: Tensor, left: Counter[str]) -> Tensor:
+def _counts(ranked: CadAlignments, symmetry: Tensor, left: Counter[str]) -> Tensor:
     """Return which predictions are neither duplicates nor too many of their category, best first."""
     close = _close(ranked, symmetry)
     alive = torch.ones(len(ranked), dtype=torch.bool)
@@ -76,11 +76,11 @@ def _kept(ranked: CadAlignments, symmetry: Tensor, left: Counter[str]) -> Tensor
         if alive[index]:
             alive[index + 1 :] &= ~close[index, index + 1 :]
     left = left.copy()
-    kept = []
+    counts = []
     for catid, is_alive in zip(ranked.catid, alive.tolist(), strict=True):
-        kept.append(is_alive and left[catid] > 0)
+        counts.append(is_alive and left[catid] > 0)
         left[catid] -= is_alive
-    return torch.tensor(kept, dtype=torch.bool)
+    return torch.tensor(counts, dtype=torch.bool)
 
 
 def _close(ranked: CadAlignments, symmetry: Tensor) -> Tensor:

@@ -17,12 +17,16 @@ from raytran.checkpoints.file import PREFIX, SUFFIX, checkpoint_path, export_wei
 from raytran.checkpoints.load import model_from, prediction_settings
 from raytran.checkpoints.network import trusted_packages
 from raytran.errors import ConfigError
-from raytran.run.export.program import SUFFIX as PROGRAM_SUFFIX
-from raytran.run.export.program import export_program
+from raytran.export.program import SUFFIX as PROGRAM_SUFFIX
+from raytran.export.program import export_program
+from raytran.run.plan.camera_paths import walk
 from raytran.run.train.build import plain
 from raytran.structs import CLASSES
 
 _log = logging.getLogger(__name__)
+
+_VIEWS_TRIED = 5
+"""Views of a made-up walk on which a program is tried before it is written."""
 
 
 def export_model(cfg: DictConfig) -> Path | None:
@@ -49,8 +53,8 @@ def export_model(cfg: DictConfig) -> Path | None:
     else:
         if cfg.dtype != "float32":
             raise ConfigError(f"dtype={cfg.dtype} is for {SUFFIX}: a program computes in float32")
-        size = prediction_settings(source).image_size
-        export_program(model, checkpoint, output, image_size=size, **plain(cfg.program))
+        cameras = walk(_VIEWS_TRIED).scaled_to(prediction_settings(source).image_size)
+        export_program(model, checkpoint, output, cameras=cameras, **plain(cfg.program))
     _log.info("wrote %s: %.1f MB", output.resolve(), output.stat().st_size / 1e6)
     return output
 

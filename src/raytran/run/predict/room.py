@@ -55,7 +55,7 @@ class RoomViews:
 
     def views_of(self, volume: int) -> Views:
         """Return the frames of one volume."""
-        return _select_views(self.views, self.members[volume])
+        return self.views.select(torch.tensor(self.members[volume]))
 
 
 def check_choice(frames: str, num_views: int | None) -> None:
@@ -144,7 +144,7 @@ def _read_chosen(
     ]
     with_frames = [index for index, of_volume in enumerate(members) if of_volume]
     return RoomViews(
-        views=_select_views(views, [position[frame] for frame in frames]),
+        views=views.select(torch.tensor([position[frame] for frame in frames])),
         frame_ids=tuple(scan.frame_id[frame] for frame in frames),
         volumes=Volumes(volumes.resolution, volumes.extent, volumes.center[with_frames]),
         members=tuple(members[index] for index in with_frames),
@@ -197,8 +197,3 @@ def _spread(frames: Tensor, count: int) -> tuple[int, ...]:
 def _select_cameras(cameras: Cameras, frames: Sequence[int]) -> Cameras:
     index = list(frames)
     return Cameras(cameras.intrinsics[index], cameras.world_from_camera[index], cameras.image_size)
-
-
-def _select_views(views: Views, frames: Sequence[int]) -> Views:
-    index = list(frames)
-    return Views(views.images[:, index], views.intrinsics[:, index], views.world_from_camera[:, index])

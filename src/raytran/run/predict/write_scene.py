@@ -91,7 +91,7 @@ def write_scene(
         ConfigError: ``output`` holds something that is no earlier result.
     """
     prediction = scene.prediction
-    cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], views.image_size)
+    cameras = Cameras.of(views.scene())
     with replaced_folder(output, marker=MARKER) as folder:
         draw_topdown(
             folder / "topdown.png", prediction, truth=truth, cameras=cameras, grid_extent=grid_extent
