@@ -7,7 +7,7 @@ import ipaddress
 import logging
 import os
 import sys
-import time
+import threading
 import webbrowser
 from pathlib import Path
 
@@ -33,20 +33,20 @@ def view(cfg: DictConfig) -> None:
     from raytran.viewer.server import free_port, quiet_server
 
     scenes, host = find_scenes(Path(cfg.folder)), str(cfg.host)
-    with quiet_server(host, free_port(host, _port(cfg.port))) as server:
-        ViewerApp(server, scenes)
-        count = "1 scene" if len(scenes) == 1 else f"{len(scenes)} scenes"
-        url = f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}/"
-        _log.info("%s of %s at %s (Ctrl-C ends it)", count, Path(cfg.folder).resolve(), url)
-        if not _is_local(host):
-            _log.warning("host=%s: whoever reaches this machine can look at these scenes", host)
-        if cfg.open and _has_screen():
-            webbrowser.open(url)
-        try:
-            while True:
-                time.sleep(3600)
-        except KeyboardInterrupt:
-            _log.info("ended")
+    port = free_port(host, _port(cfg.port))
+    try:
+        with quiet_server(host, port) as server:
+            ViewerApp(server, scenes)
+            count = "1 scene" if len(scenes) == 1 else f"{len(scenes)} scenes"
+            url = f"http://{f'[{host}]' if ':' in host else host}:{server.get_port()}/"
+            _log.info("%s of %s at %s (Ctrl-C ends it)", count, Path(cfg.folder).resolve(), url)
+            if not _is_local(host):
+                _log.warning("host=%s: whoever reaches this machine can look at these scenes", host)
+            if cfg.open and _has_screen():
+                webbrowser.open(url)
+            threading.Event().wait()
+    except KeyboardInterrupt:
+        _log.info("ended")
 
 
 def _port(value: object) -> int | None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import io
 import logging
 import socket
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
@@ -30,13 +31,18 @@ def quiet_server(host: str = "127.0.0.1", port: int = 0) -> Iterator[viser.Viser
         port: 0 for any that is free.
     """
     logging.getLogger("websockets.server").setLevel(logging.WARNING)
+    before = set(threading.enumerate())
     with redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port, label="raytran", verbose=False)
+    loop = [thread for thread in threading.enumerate() if thread.daemon and thread not in before]
     try:
         yield server
     finally:
         with redirect_stdout(io.StringIO()):
             server.stop()
+            # viser waits a while for its thread, which on a busy machine says good-bye later.
+            for thread in loop:
+                thread.join(timeout=30)
 
 
 def free_port(host: str, port: int | None) -> int:
