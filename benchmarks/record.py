@@ -17,6 +17,7 @@ from typing import Any
 import torch
 
 from raytran.checkpoints.card import git_commit
+from raytran.data.files import whole_file
 
 
 @cache
@@ -44,13 +45,10 @@ def write_rows(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Write rows of figures, the circumstances behind them; print where."""
     full = [{**row, **circumstances()} for row in rows]
     names = list(dict.fromkeys(name for row in full for name in row))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.part")
-    with temporary.open("w", newline="", encoding="utf-8") as file:
+    with whole_file(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=names, restval="")
         writer.writeheader()
         writer.writerows(full)
-    os.replace(temporary, path)
     print(f"wrote {path}")
 
 

@@ -151,8 +151,10 @@ def _choices_table(name: str) -> list[str]:
             continue
         for path in sorted((CONF / group).glob("*.yaml")):
             if path.stem != "base":
-                mark = "default" if path.stem == chosen else ""
-                rows.append(f"| `{group}={path.stem}` | {mark} | {_cell(header(path))} |")
+                several = isinstance(chosen, list)  # any number of them may be chosen
+                typed = f"[{path.stem}]" if several else path.stem
+                mark = "default" if path.stem in (chosen if several else [chosen]) else ""
+                rows.append(f"| `{group}={typed}` | {mark} | {_cell(header(path))} |")
     return rows
 
 

@@ -80,6 +80,13 @@ def test_parts(path):
     build_everything(chosen(path))
 
 
+@pytest.mark.parametrize("preset", files("preset"), ids=name)
+def test_every_image_encoder_goes_with_every_preset(preset):
+    for encoder in files("model/encoder"):
+        config = compose("train", [f"preset={preset.name}", f"model/encoder={encoder.name}", "output_dir=x"])
+        instantiate(plain(config)["model"]["backbone"]["encoder"] | {"weights": None})
+
+
 @pytest.mark.parametrize("path", files("preset"), ids=name)
 def test_presets(path):
     config = chosen(path)

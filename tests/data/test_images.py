@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from raytran.data.images import decode_image, read_image, read_images, resize, stored_size
+from raytran.data.images import decode_image, read_frames, resize, stored_size
 from raytran.errors import DataError
 
 from ..scan_forms import write_claiming_png
@@ -24,6 +24,16 @@ def paths(tmp_path):
     for n in range(6):
         Image.new("RGB", (16, 8), (10 * n,) * 3).save(folder / f"{n}.jpg")
     return [folder / f"{n}.jpg" for n in range(6)]
+
+
+def read_image(path, image_size, stored=None):
+    return decode_image(path, name=str(path), image_size=image_size, stored=stored)
+
+
+def read_images(paths, chosen, **sizes):
+    return read_frames(
+        lambda position: read_image(paths[position], **sizes), len(paths), chosen, where=paths[0].parent
+    )
 
 
 def cut(path) -> None:

@@ -145,8 +145,11 @@ def test_attention_is_computed_as_the_run_says(settings, tmp_path, monkeypatch):
     more = [
         "experiment=stage1",
         "trainer.max_steps=1",
-        "trainer.val_check_interval=1",
+        "+trainer.limit_val_batches=0",
+        "views.num_views=2",
+        "views.batch_size=1",
         "model.rays_per_cell=1",
+        "model.backbone.num_blocks=1",
     ]
     fits = {
         name: fit(settings, tmp_path / name, *more, f"model.attention={name}") for name in ("fused", "sparse")

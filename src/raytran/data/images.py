@@ -29,23 +29,6 @@ _UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
 """What Pillow raises for files that are truncated, damaged, absurdly large or no images."""
 
 
-def read_image(path: Path, image_size: tuple[int, int], *, stored: tuple[int, int] | None = None) -> Tensor:
-    """Read an image and resize it, not keeping its aspect.
-
-    Args:
-        path: a JPEG or PNG file.
-        image_size: ``(H, W)`` wanted.
-        stored: ``(H, W)`` that the file must have, or None for any.
-
-    Returns:
-        ``(3, H, W)`` uint8 RGB, a view of ``(H, W, 3)``.
-
-    Raises:
-        DataError: the file is truncated, damaged, or of another size than ``stored``.
-    """
-    return decode_image(path, name=str(path), image_size=image_size, stored=stored)
-
-
 def decode_image(
     image: Path | bytes,
     *,
@@ -91,40 +74,6 @@ def resize(pixels: NDArray[np.uint8], image_size: tuple[int, int]) -> NDArray[np
     return np.array(Image.fromarray(pixels).resize(image_size[::-1], Image.Resampling.BILINEAR))
 
 
-def read_images(
-    paths: Sequence[Path],
-    chosen: Sequence[int],
-    *,
-    image_size: tuple[int, int],
-    stored: tuple[int, int],
-    min_views: int = MIN_VIEWS,
-) -> tuple[Tensor, list[int]]:
-    """Read the chosen images; an unreadable one is replaced by the nearest one not yet taken.
-
-    If all images are taken the nearest readable one comes twice, so the number of images stays N.
-
-    Args:
-        paths: every image of the scan.
-        chosen: positions of N of them.
-        image_size: ``(H, W)`` wanted.
-        stored: ``(H, W)`` of the files.
-        min_views: fewest different images, or as many as were chosen if that is less.
-
-    Returns:
-        ``(N, 3, H, W)`` uint8 and the N positions that were read.
-
-    Raises:
-        DataError: fewer than ``min_views`` different images can be read.
-    """
-    return read_frames(
-        lambda position: read_image(paths[position], image_size, stored=stored),
-        len(paths),
-        chosen,
-        where=paths[0].parent,
-        min_views=min_views,
-    )
-
-
 def read_frames(
     read: Callable[[int], Tensor],
     num_frames: int,
@@ -133,7 +82,9 @@ def read_frames(
     where: Path,
     min_views: int = MIN_VIEWS,
 ) -> tuple[Tensor, list[int]]:
-    """Read the chosen frames as ``read_images`` does; frames need not be files.
+    """Read the chosen frames; an unreadable one is replaced by the nearest one not yet taken.
+
+    If all frames are taken the nearest readable one comes twice, so that there are N images in any case.
 
     Args:
         read: returns ``(3, H, W)`` uint8 of the frame at a position, or raises DataError if it is damaged.

@@ -208,10 +208,10 @@ def evaluate_model(
     ).to(device)
     model.eval()
     forward_tasks = [task for task in tasks if task != "shape"]  # shapes are decoded of chosen objects alone
-    repeated = RepeatedFrames()
+    repeated_frames = RepeatedFrames()
     for index in track(range(len(dataset)), "evaluating", disable=not progress, transient=True):  # type: ignore[arg-type]
         batch = dataset[index].to(device)
-        repeated.look(batch)
+        repeated_frames.look(batch)
         new = {} if batch.new_views is None else {"new_cameras": Cameras.of(batch.new_views)}
         raw = model(
             batch.views,

@@ -74,21 +74,20 @@ def render_views(
     owner = room.volumes.owner(places_ahead(cameras))
     with finished_folder(output / NEW_VIEWS) as folder:
         for volume, center in enumerate(room.volumes.center):
-            mine = (owner == volume).nonzero().squeeze(1).tolist()
-            if not mine:
+            indices = (owner == volume).nonzero().squeeze(1).tolist()  # of the cameras that see this volume
+            if not indices:
                 continue
-            intrinsics, poses = cameras.intrinsics[mine][None], cameras.world_from_camera[mine][None]
+            intrinsics, poses = cameras.intrinsics[indices][None], cameras.world_from_camera[indices][None]
             images = model.render(
                 room.views_of(volume).to(device),
                 Cameras(intrinsics.to(device), poses.to(device), cameras.image_size),
                 views_at_once=views_at_once,
                 grid_center=center.float().to(device),
             )
-            written = iter(mine)
-            for image in (image for chunk in images for image in chunk.cpu()):
-                index = next(written)
+            rendered = (image for chunk in images for image in chunk.cpu())
+            for index, image in zip(indices, rendered, strict=True):
                 _picture(image, wanted.lenses[index].size).save(folder / f"{wanted.names[index]}.png")
-    _warn_of_blind(cameras, room)
+    _warn_of_cameras_outside(cameras, room)
     _log.info("rendered %d new views: %s", len(wanted), (output / NEW_VIEWS).resolve())
     return output / NEW_VIEWS
 
@@ -99,7 +98,7 @@ def _picture(image: Tensor, size: tuple[int, int]) -> Image.Image:
     return Image.fromarray(pixels).resize(size[::-1], Image.Resampling.BICUBIC)
 
 
-def _warn_of_blind(cameras: Cameras, room: RoomViews) -> None:
+def _warn_of_cameras_outside(cameras: Cameras, room: RoomViews) -> None:
     """Say how many cameras stand outside of all volumes: what they see was hardly trained."""
     outside = int((~room.volumes.holds(cameras.position).any(dim=1)).sum())
     if outside:
