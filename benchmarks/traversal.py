@@ -12,9 +12,8 @@ from record import write_rows
 from timing import MEBIBYTE, Run, measure, print_machine
 
 from raytran.geometry.camera import Cameras
-from raytran.ops.pairs import PairList
+from raytran.ops.pairs import PairList, listed
 from raytran.ops.tracer import RayTracer
-from raytran.ops.triton.dispatch import listed
 
 
 def tracers(

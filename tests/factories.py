@@ -23,7 +23,7 @@ from raytran.heads.objects import ObjectHead
 from raytran.heads.shape import ShapeHead
 from raytran.heads.view import ViewHead
 from raytran.model import RayTran
-from raytran.ops.ray_attention import Pairs
+from raytran.ops.pairs import Pairs
 from raytran.structs import ObjectSet, Views
 
 RESOLUTION, EXTENT, CHANNELS = (6, 6, 4), (6.0, 6.0, 3.0), 16

@@ -14,13 +14,13 @@ from torch import Tensor
 from gpu_day.context import Context
 from raytran.geometry.camera import Cameras
 from raytran.ops import reference
+from raytran.ops.pairs import listed
 from raytran.ops.ray_attention import Direction, ray_attention
 from raytran.ops.splat import splat_features
 from raytran.ops.tracer import RayTracer
 from raytran.ops.traverse import trace_pairs
 from raytran.ops.triton import block_pairs
 from raytran.ops.triton.block_pairs import BlockPairs
-from raytran.ops.triton.dispatch import listed
 from raytran.run.plan.camera_paths import walk
 
 DIRECTIONS: tuple[Direction, ...] = ("pixels_to_voxels", "voxels_to_pixels")

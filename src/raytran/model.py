@@ -20,7 +20,7 @@ from raytran.errors import ConfigError, ShapeError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.heads.objects import ObjectOutputs, objects_of_queries
-from raytran.ops.ray_attention import Pairs
+from raytran.ops.pairs import Pairs
 from raytran.ops.tracer import Attention, RayTracer
 from raytran.ops.traverse import count_views
 from raytran.structs import ObjectSet, RawScene, SceneBatch, ScenePrediction, Views

@@ -64,6 +64,7 @@ SYMMETRY_INFINITE: int = 0
 """Value of ``ObjectSet.symmetry`` for a body of revolution; 1, 2 and 4 are the number of equal turns."""
 
 
+_Made = TypeVar("_Made")
 _Struct = TypeVar("_Struct", bound="TensorStruct")
 
 
@@ -101,6 +102,17 @@ class TensorStruct:
             return None if value is None else value[index]
 
         return replace(self, **{field.name: pick(getattr(self, field.name)) for field in fields(self)})
+
+
+def cached(struct: TensorStruct, name: str, make: Callable[[], _Made]) -> _Made:
+    """Return what ``make`` returned when ``struct`` was first asked for ``name``.
+
+    Not ``functools.cached_property``: until Python 3.12 it holds a lock, through which ``torch.compile``
+    cannot pass.
+    """
+    if not hasattr(struct, name):
+        object.__setattr__(struct, name, make())
+    return getattr(struct, name)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 import raytran.ops
-from raytran.ops.triton.dispatch import MOST_CHANNELS
+from raytran.ops.pairs import MOST_CHANNELS
 
 pytest.importorskip("triton", reason="Triton is not installed: there is no compiler to ask")
 

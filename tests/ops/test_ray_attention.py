@@ -7,11 +7,11 @@ from torch import Tensor
 from torch._dynamo.testing import CompileCounterWithBackend
 
 from raytran.errors import ShapeError
+from raytran.ops import pairs as fused
 from raytran.ops import reference
 from raytran.ops import sparse as pair_attention
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_attention import ray_attention, ray_attention_with_sum
-from raytran.ops.triton import dispatch as fused
 
 DIRECTIONS = ("pixels_to_voxels", "voxels_to_pixels")
 both_directions = pytest.mark.parametrize("direction", DIRECTIONS)

@@ -16,7 +16,7 @@ from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.position import position_code, ray_code
-from raytran.ops.ray_attention import Pairs
+from raytran.ops.pairs import Pairs
 from raytran.ops.splat import splat_in_chunks
 from raytran.ops.tracer import RayTracer
 

@@ -8,7 +8,8 @@ from typing import Literal
 
 from torch import Tensor, nn
 
-from raytran.ops.ray_attention import Direction, Pairs, ray_attention_in_chunks
+from raytran.ops.pairs import Pairs
+from raytran.ops.ray_attention import Direction, ray_attention_in_chunks
 
 
 class RayTracedBlock(nn.Module):

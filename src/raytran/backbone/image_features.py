@@ -69,7 +69,8 @@ class ImageFeatures(nn.Module):
         Raises:
             ShapeError: images have other channels than the encoder, or sides not divisible by the stride.
         """
-        check_shape(images, f"B N {self.encoder.input_channels} H W", "images")
+        if images.ndim != 5 or images.shape[2] != self.encoder.input_channels:
+            check_shape(images, f"B N {self.encoder.input_channels} H W", "images")
         if images.shape[-2] % self.stride or images.shape[-1] % self.stride:
             raise ShapeError(
                 f"expected images with sides divisible by {self.stride}, got {tuple(images.shape[-2:])}"

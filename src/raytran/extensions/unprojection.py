@@ -17,8 +17,7 @@ from raytran.backbone.image_features import ImageEncoder
 from raytran.extensions.unet3d import VoxelEncoderDecoder
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.ops.pairs import PairList
-from raytran.ops.ray_attention import Pairs
+from raytran.ops.pairs import PairList, Pairs
 from raytran.ops.splat import splat_in_chunks
 from raytran.ops.tracer import RayTracer
 

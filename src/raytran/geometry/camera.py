@@ -36,8 +36,10 @@ class Cameras:
     image_size: tuple[int, int]
 
     def __post_init__(self) -> None:
-        check_shape(self.intrinsics, "... 3 3", "intrinsics")
-        check_shape(self.world_from_camera, "... 4 4", "world_from_camera")
+        if self.intrinsics.shape[-2:] != (3, 3):
+            check_shape(self.intrinsics, "... 3 3", "intrinsics")
+        if self.world_from_camera.shape[-2:] != (4, 4):
+            check_shape(self.world_from_camera, "... 4 4", "world_from_camera")
         if self.intrinsics.shape[:-2] != self.world_from_camera.shape[:-2]:
             raise ShapeError(
                 "expected as many intrinsics as poses, got "

@@ -30,7 +30,8 @@ class VoxelGrid:
         object.__setattr__(self, "center", center if center.is_floating_point() else center.float())
         object.__setattr__(self, "resolution", tuple(int(n) for n in self.resolution))
         object.__setattr__(self, "extent", tuple(float(length) for length in self.extent))
-        check_shape(self.center, "... 3", "center")
+        if self.center.shape[-1:] != (3,):
+            check_shape(self.center, "... 3", "center")
 
     @property
     def num_voxels(self) -> int:

@@ -46,7 +46,8 @@ def yaw_from_rotation(rotation: Tensor) -> Tensor:
     Returns:
         ``(...)`` radians in (-π, π].
     """
-    check_shape(rotation, "... 3 3", "rotation")
+    if rotation.shape[-2:] != (3, 3):
+        check_shape(rotation, "... 3 3", "rotation")
     # Columns of R · Bᵀ: B swaps y and z up to a sign, so N01 = -R02 and N11 = -R12.
     return torch.atan2(rotation[..., 1, 0] + rotation[..., 0, 2], rotation[..., 0, 0] - rotation[..., 1, 2])
 

@@ -12,7 +12,7 @@ from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.position import ray_code
 from raytran.heads.dense import image_upsampler
-from raytran.ops.ray_attention import Pairs
+from raytran.ops.pairs import Pairs
 
 
 class ViewHead(nn.Module):

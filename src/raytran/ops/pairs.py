@@ -1,21 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The list of pixel-voxel pairs that a ray joins, in both orders (RayTran §3.1)."""
+"""The pixel-voxel pairs that a ray joins (RayTran §3.1), and what computes with them.
+
+On a GPU with Triton fused kernels take the pairs in blocks (``ops.triton``). Elsewhere products of
+``torch.sparse`` take them as a list, in two orders.
+"""
 
 from __future__ import annotations
 
+import logging
+import os
 from dataclasses import dataclass
+from functools import cache
+from importlib.util import find_spec
 from math import prod
-from typing import Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from raytran.errors import ShapeError, check_shape
-from raytran.ops.triton.block_pairs import BlockPairs, kept
+from raytran.ops.triton.block_pairs import BlockPairs
 from raytran.ops.triton.tiling import Tiling
-from raytran.structs import TensorStruct
+from raytran.structs import TensorStruct, cached
 
 Side = Literal["pixels", "voxels"]
+
+MOST_CHANNELS = {torch.float16: 128, torch.bfloat16: 128, torch.float32: 64}
+"""Channels of a head up to which the fused kernels fit into a GPU's registers, by the dtype of the inputs."""
+
+_log = logging.getLogger(__name__)
 
 
 class PairOrder(NamedTuple):
@@ -60,9 +73,13 @@ class PairList(TensorStruct):
     pixel_shape: tuple[int, int, int] | None = None
     voxel_shape: tuple[int, int, int, int] | None = None
     fused: bool = True
+    # No field: a copy on another device makes its own orders.
+    _orders: ClassVar[dict[Side, PairOrder]]
 
     def __post_init__(self) -> None:
-        check_shape(self.pixel_index, "P", "pixel_index")
+        object.__setattr__(self, "_orders", {})
+        if self.pixel_index.ndim != 1:
+            check_shape(self.pixel_index, "P", "pixel_index")
         if self.pixel_index.shape != self.voxel_index.shape:
             raise ShapeError(
                 "expected as many pixels as voxels, got "
@@ -82,11 +99,11 @@ class PairList(TensorStruct):
 
     def by(self, rows: Side) -> PairOrder:
         """Return the pairs as compressed rows, one per pixel or one per voxel; made once and kept."""
-        if rows == "pixels":
-            return kept(self, "_by_pixels", self._order_by_pixels)
-        if rows == "voxels":
-            return kept(self, "_by_voxels", self._order_by_voxels)
-        raise ValueError(f"rows must be 'pixels' or 'voxels', got {rows!r}")
+        if rows not in self._orders:
+            if rows not in ("pixels", "voxels"):
+                raise ValueError(f"rows must be 'pixels' or 'voxels', got {rows!r}")
+            self._orders[rows] = self._order_by_pixels() if rows == "pixels" else self._order_by_voxels()
+        return self._orders[rows]
 
     def pixels_per_voxel(self) -> Tensor:
         """Return with how many pixels each voxel is paired, ``(num_voxels,)`` int32."""
@@ -94,7 +111,7 @@ class PairList(TensorStruct):
 
     def blocks(self) -> BlockPairs:
         """Return the pairs as masks of pixel tiles and voxel blocks; made once and kept."""
-        return kept(self, "_blocks", self._gather_blocks)
+        return cached(self, "_blocks", self._gather_blocks)
 
     def _gather_blocks(self) -> BlockPairs:
         pixels = Tiling.of_pixels(self.num_pixels, self.pixel_shape)
@@ -111,6 +128,55 @@ class PairList(TensorStruct):
         # Stable, so that pixels rise within a voxel and the order of every sum is fixed.
         voxel, place = torch.sort(self.voxel_index, stable=True)
         return PairOrder(_offsets(voxel, self.num_voxels), self.pixel_index[place].int(), place)
+
+
+Pairs = PairList | BlockPairs
+"""The pixel-voxel pairs of some views, in either form."""
+
+
+def interpreted() -> bool:
+    """Return whether Triton's kernels run in its interpreter: on any device, slowly, to be tested."""
+    return os.environ.get("TRITON_INTERPRET") == "1"
+
+
+def why_no_kernels(device: torch.device) -> str | None:
+    """Say why the fused kernels do not run on a device, None where they do."""
+    if device.type != "cuda":
+        return f"tensors are on the {device.type.upper()}"
+    return None if find_spec("triton") is not None else "Triton is not installed"
+
+
+def fused_blocks(pairs: Pairs, device: torch.device, dtype: torch.dtype, channels: int) -> BlockPairs | None:
+    """Return the block pairs for the fused kernels; None, and say once why, where they do not run.
+
+    Args:
+        pairs: the pairs; block pairs on a CPU ask for Triton's interpreter, if that is switched on.
+        device: of the features.
+        dtype: of the features.
+        channels: of each head.
+    """
+    reason = None if interpreted() and isinstance(pairs, BlockPairs) else why_no_kernels(device)
+    if isinstance(pairs, PairList) and not pairs.fused:
+        reason = "the pairs ask for it"
+    elif reason is None and channels > MOST_CHANNELS.get(dtype, 0):
+        reason = f"heads have {channels} channels in {dtype}"
+    if reason is None:
+        return pairs.blocks() if isinstance(pairs, PairList) else pairs
+    if not torch.compiler.is_compiling():
+        _log_once(logging.WARNING if device.type == "cuda" else logging.DEBUG, reason)
+    return None
+
+
+def listed(pairs: Pairs) -> PairList:
+    """Return the pairs as a list; made once and kept."""
+    if isinstance(pairs, PairList):
+        return pairs
+    return cached(pairs, "_listed", lambda: PairList.from_blocks(pairs))
+
+
+@cache
+def _log_once(level: int, reason: str) -> None:
+    _log.log(level, "pixels and voxels are joined by torch.sparse and not in fused kernels: %s", reason)
 
 
 def _offsets(row_index: Tensor, num_rows: int) -> Tensor:

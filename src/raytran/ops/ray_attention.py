@@ -16,15 +16,10 @@ import torch
 from torch import Tensor
 
 from raytran.errors import check_shape
-from raytran.ops.pairs import PairList
+from raytran.ops.pairs import Pairs, fused_blocks, listed
 from raytran.ops.sparse import pair_attention
-from raytran.ops.triton.block_pairs import BlockPairs
-from raytran.ops.triton.dispatch import fused_blocks, listed
 
 Direction = Literal["pixels_to_voxels", "voxels_to_pixels"]
-
-Pairs = PairList | BlockPairs
-"""The pixel-voxel pairs of some views: a list for ``torch.sparse``, or blocks for the fused kernels."""
 
 
 def ray_attention(

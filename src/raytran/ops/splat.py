@@ -10,10 +10,8 @@ import torch
 from torch import Tensor
 
 from raytran.errors import check_shape
-from raytran.ops.pairs import PairOrder
-from raytran.ops.ray_attention import Pairs
+from raytran.ops.pairs import PairOrder, Pairs, fused_blocks, listed
 from raytran.ops.sparse import sparse_product
-from raytran.ops.triton.dispatch import fused_blocks, listed
 
 
 def splat_features(features: Tensor, pairs: Pairs) -> tuple[Tensor, Tensor]:

@@ -11,9 +11,8 @@ import torch
 from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.ops.ray_attention import Pairs
+from raytran.ops.pairs import Pairs, interpreted, why_no_kernels
 from raytran.ops.traverse import trace_pairs
-from raytran.ops.triton.dispatch import interpreted, why_no_kernels
 
 Attention = Literal["auto", "fused", "sparse"]
 """By what ray-traced attention is computed: fused kernels where they run, fused kernels, or torch.sparse."""

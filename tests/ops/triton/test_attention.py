@@ -223,7 +223,7 @@ def test_tuples_of_the_kernels_hold_tensors_alone(random_pairs, generator):
     ("dtype", "channels"), [(torch.float32, 128), (torch.bfloat16, 256), (torch.float64, 8)]
 )
 def test_heads_that_do_not_fit_a_gpu_are_left_to_torch_sparse(random_pairs, generator, dtype, channels):
-    from raytran.ops.triton.dispatch import fused_blocks
+    from raytran.ops.pairs import fused_blocks
 
     pairs = random_pairs(9, 14, 0.4)
     assert fused_blocks(pairs.blocks(), torch.device(DEVICE), dtype, channels) is None
@@ -234,7 +234,7 @@ def test_heads_that_do_not_fit_a_gpu_are_left_to_torch_sparse(random_pairs, gene
 
 
 def test_pairs_that_ask_for_torch_sparse_get_it(random_pairs):
-    from raytran.ops.triton.dispatch import fused_blocks
+    from raytran.ops.pairs import fused_blocks
 
     pairs = random_pairs(9, 14, 0.4)
     for device in ("cpu", "cuda"):

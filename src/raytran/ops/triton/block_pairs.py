@@ -14,17 +14,14 @@ Nothing here waits for a GPU: sizes that depend on the data are capacities, and 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, TypeVar
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from raytran.ops.triton.tiling import PART, PARTS, ROW, Tiling
-from raytran.structs import TensorStruct
-
-Made = TypeVar("Made")
+from raytran.structs import TensorStruct, cached
 
 _SLOTS = 512
 """Slots of scratch memory, for the pieces of long rows."""
@@ -112,7 +109,7 @@ class BlockPairs(TensorStruct):
 
     def pixels_per_voxel(self) -> Tensor:
         """Return with how many pixels each voxel is paired, ``(num_voxels,)`` int64; made once and kept."""
-        return kept(self, "_pixels_per_voxel", self._count_pixels)
+        return cached(self, "_pixels_per_voxel", self._count_pixels)
 
     def _count_pixels(self) -> Tensor:
         # Bits are added up in pairs, nibbles, bytes ("Hacker's Delight" §5-1).
@@ -129,8 +126,8 @@ class BlockPairs(TensorStruct):
     def by(self, rows: Literal["pixels", "voxels"]) -> BlockOrder:
         """Return the pairs in rows, one per pixel tile or one per voxel block; made once and kept."""
         if rows == "pixels":
-            return kept(self, "_by_pixels", self._order_by_pixels)
-        return kept(self, "_by_voxels", self._order_by_voxels)
+            return cached(self, "_by_pixels", self._order_by_pixels)
+        return cached(self, "_by_voxels", self._order_by_voxels)
 
     def _order_by_pixels(self) -> BlockOrder:
         return self._order(0, self._tile, self._block, self.pixels, self.voxels)
@@ -159,17 +156,6 @@ class BlockPairs(TensorStruct):
         part_start = others.start(other)[pair] + others.offset(part * PART)
         place = (pair * 2 + side) * PARTS + part
         return BlockOrder(part_start.int(), place.int(), items, merges)
-
-
-def kept(struct: TensorStruct, name: str, make: Callable[[], Made]) -> Made:
-    """Return what ``make`` made for a struct when it was first asked for ``name``.
-
-    Not ``functools.cached_property``: until Python 3.12 it holds a lock, through which ``torch.compile``
-    cannot pass.
-    """
-    if not hasattr(struct, name):
-        object.__setattr__(struct, name, make())
-    return getattr(struct, name)
 
 
 def _schedule(offsets: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
