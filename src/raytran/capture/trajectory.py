@@ -225,7 +225,7 @@ def read_tum(path: Path) -> Recording:
         raise DataError(f"{path} has no images: put them in its folder rgb or images")
     lens = read_camera(find_intrinsics(path), stored_size([image for image, _ in images]))
     poses = poses_at(track, np.array([time for _, time in images]))
-    has_pose = np.isfinite(poses).all(axis=(1, 2)).tolist()
+    has_pose = [bool(np.isfinite(pose).all()) for pose in poses]
     if not any(has_pose):
         raise DataError(
             f"none of the {len(images)} images of {path} has a pose at its time among the {len(track)} "

@@ -178,7 +178,7 @@ def read_video(path: Path) -> Recording:
         file.close()
     lens = read_camera(listed, image_size)
     poses = _poses(track, times, video)
-    has_pose = np.isfinite(poses).all(axis=(1, 2)).tolist()
+    has_pose = [bool(np.isfinite(pose).all()) for pose in poses]
     return Recording(
         path=video,
         scene_id=video.stem,
