@@ -110,7 +110,7 @@ def test_the_baseline_without_attention():
 
 def test_weights_get_their_names_of_today():
     names = {
-        "model.backbone.encoder.conv1.weight": "model.backbone.image_features.encoder.conv1.weight",
+        "model.backbone.resnet.conv1.weight": "model.backbone.image_features.encoder.conv1.weight",
         "model.backbone.projection.bias": "model.backbone.image_features.projection.bias",
         "model.backbone.volume.up.0.grow.weight": "model.backbone.voxel_network.up.0.convolution.weight",
         "model.backbone.volume.down.0.0.bn1.bias": "model.backbone.voxel_network.down.0.0.bn1.bias",

@@ -129,7 +129,7 @@ def test_frozen_parts_stay_in_evaluation_mode(batch, make_module):
     assert len(modes) == 3
     for mode in modes:
         assert mode["heads.shape"]
-        assert mode["heads.shape.grow.0"]
+        assert mode["heads.shape.upsampler.0"]
         assert not any(
             training for name, training in mode.items() if name.startswith(("backbone", "heads.objects"))
         )
