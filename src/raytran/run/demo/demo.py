@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import json
 import logging
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,12 +19,11 @@ from rich.table import Table
 from raytran.checkpoints.file import shipped_weights
 from raytran.checkpoints.load import load_model, prediction_settings
 from raytran.checkpoints.network import own_packages
-from raytran.data.files import SettingsRecord
+from raytran.data.files import SettingsRecord, write_json
 from raytran.errors import ConfigError
 from raytran.model import RayTran
 from raytran.run.demo.page import COLUMNS, ShownScene, headline, write_page
-from raytran.run.demo.steps import StepTimes
-from raytran.run.entry import compose
+from raytran.run.entry import compose, quoted
 from raytran.run.evaluate.evaluate import TASKS_WITH_SHAPE, about_data, evaluate_model
 from raytran.run.evaluate.results import write_evaluation
 from raytran.run.predict.predict import predict_scene
@@ -90,7 +92,7 @@ def demo(cfg: DictConfig) -> DemoResult:
         ConfigError: the folder holds a demo with other settings.
     """
     output = Path(cfg.output).resolve()
-    overrides = [f"preset={cfg.preset}", f"data.root={_quoted(output / 'rooms')}", *plain(cfg.overrides)]
+    overrides = [f"preset={cfg.preset}", f"data.root={quoted(output / 'rooms')}", *plain(cfg.overrides)]
     data = _data(overrides, output)
     times = StepTimes(output / "times.json")
     with times.measure("rooms", continues=True):
@@ -113,7 +115,7 @@ def _data(overrides: Sequence[str], output: Path) -> SceneDataModule:
     Raises:
         ConfigError: ``output`` holds a demo with other settings.
     """
-    cfg = compose("train", [*overrides, *_SETTINGS, f"output_dir={_quoted(output)}"])
+    cfg = compose("train", [*overrides, *_SETTINGS, f"output_dir={quoted(output)}"])
     wanted = {
         name: value if isinstance(value := cfg[name], str | int) else plain(value) for name in _RECORDED
     }
@@ -199,7 +201,38 @@ def _tell(page: Path, metrics: Mapping[str, Mapping[str, Any]], seconds: Mapping
     console.print(f"Open {page}", soft_wrap=True)
 
 
-def _quoted(path: Path) -> str:
-    """Return a path as Hydra's override grammar wants it."""
-    escaped = str(path).replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'
+class StepTimes:
+    """Seconds per step, in the order of their first appearance, kept in a file.
+
+    Args:
+        path: JSON file; what it holds is read first.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            self.seconds: dict[str, float] = json.loads(path.read_text())
+        except (OSError, ValueError):
+            # Times are told, nothing depends on them.
+            self.seconds = {}
+
+    @contextmanager
+    def measure(self, name: str, *, continues: bool = False) -> Iterator[None]:
+        """Time a block and say so in the log.
+
+        Args:
+            name: of the step.
+            continues: the step goes on where a killed run left it, so times add up; else the last one counts.
+        """
+        _log.info("%s …", name)
+        began = time.monotonic()
+        try:
+            yield
+        finally:
+            self.add(name, time.monotonic() - began, continues=continues)
+        _log.info("%s: %.1f s", name, self.seconds[name])
+
+    def add(self, name: str, seconds: float, *, continues: bool = False) -> None:
+        """Enter the time of a step that was measured elsewhere."""
+        self.seconds[name] = seconds + (self.seconds.get(name, 0.0) if continues else 0.0)
+        write_json(self._path, self.seconds)
