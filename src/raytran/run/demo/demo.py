@@ -49,8 +49,8 @@ _SETTINGS = (
 
 
 @dataclass(frozen=True)
-class Asked:
-    """A network, and the rooms it is asked about.
+class Evaluated:
+    """A network, and the rooms it is evaluated on.
 
     Attributes:
         model: the network.
@@ -135,13 +135,13 @@ def _train(overrides: Sequence[str], folder: Path, times: StepTimes) -> list[Fit
     return fits
 
 
-def _asked(overrides: Sequence[str], data: SceneDataModule, checkpoint: Path) -> dict[str, Asked]:
-    """Return who is asked about what, by ``COLUMNS``: the package's weights too, if it has any."""
+def _asked(overrides: Sequence[str], data: SceneDataModule, checkpoint: Path) -> dict[str, Evaluated]:
+    """Return networks and the rooms to evaluate them on, by ``COLUMNS``; shipped weights too, if any."""
     # The network was composed from what is typed here, not out of a file: its own classes are trusted.
     cfg = compose("train", [*overrides, *_SETTINGS, "output_dir=unused"])
     model = load_model(checkpoint, trust=own_packages(plain(cfg.model)))
     views = int(cfg.views.predict_views)
-    asked = {split: Asked(model, checkpoint, data, split, views) for split in ("train", "val")}
+    asked = {split: Evaluated(model, checkpoint, data, split, views) for split in ("train", "val")}
     shipped = shipped_weights()
     if shipped is not None:
         model, wanted = load_model(shipped), prediction_settings(shipped)
@@ -153,11 +153,11 @@ def _asked(overrides: Sequence[str], data: SceneDataModule, checkpoint: Path) ->
         }
         settings = [f"{name}={list(value)}" for name, value in fit.items()]
         cfg = compose("train", [*overrides, *_SETTINGS, *settings])
-        asked["shipped"] = Asked(model, shipped, build_data(cfg), "val", views)
+        asked["shipped"] = Evaluated(model, shipped, build_data(cfg), "val", views)
     return asked
 
 
-def _evaluate(cfg: DictConfig, asked: Asked, output: Path) -> dict[str, Any]:
+def _evaluate(cfg: DictConfig, asked: Evaluated, output: Path) -> dict[str, Any]:
     about = {"checkpoint": str(asked.checkpoint), **about_data(asked.data, asked.split, asked.num_views)}
     evaluation = evaluate_model(
         asked.model,
@@ -171,7 +171,7 @@ def _evaluate(cfg: DictConfig, asked: Asked, output: Path) -> dict[str, Any]:
     return evaluation.metrics
 
 
-def _predict_first(cfg: DictConfig, name: str, asked: Asked, output: Path) -> ShownScene:
+def _predict_first(cfg: DictConfig, name: str, asked: Evaluated, output: Path) -> ShownScene:
     """Predict the first of the rooms; write what ``raytran.predict`` writes, the truth in the plan."""
     batch = asked.data.split(asked.split)[0]
     scene = predict_scene(
@@ -202,7 +202,7 @@ def _tell(page: Path, metrics: Mapping[str, Mapping[str, Any]], seconds: Mapping
 
 
 class StepTimes:
-    """Seconds per step, in the order of their first appearance, kept in a file.
+    """Seconds per step of the demo, in the order of their first appearance, kept in a file over kills.
 
     Args:
         path: JSON file; what it holds is read first.
@@ -213,7 +213,7 @@ class StepTimes:
         try:
             self.seconds: dict[str, float] = json.loads(path.read_text())
         except (OSError, ValueError):
-            # Times are told, nothing depends on them.
+            # Times are only shown, nothing depends on them.
             self.seconds = {}
 
     @contextmanager
