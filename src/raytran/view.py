@@ -6,8 +6,7 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING
 
-from raytran.run.entry import entry_point
-from raytran.run.positional import name_positional
+from raytran.run.entry import entry_point, name_positional
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig

@@ -16,8 +16,7 @@ from hydra.errors import OverrideParseException
 from omegaconf import OmegaConf
 
 from raytran.run.config_dir import config_dir
-from raytran.run.entry import entry_point
-from raytran.run.positional import name_positional
+from raytran.run.entry import entry_point, name_positional
 
 COMMAND = re.compile(r"-m raytran\.(\w+)((?:\\\n|[^\n`])*)")
 POSITIONAL = {"view": {"key": "folder"}}

@@ -9,7 +9,7 @@ from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 
 from raytran.errors import DataError
-from raytran.run.entry import compose, run_or_exit
+from raytran.run.entry import compose, name_positional, run_or_exit
 
 
 def raise_error(error):
@@ -82,3 +82,15 @@ def test_help_names_the_settings_without_loading_torch(name, tmp_path):
 def test_compose_is_what_the_command_line_would_compose():
     cfg = compose("train", ["preset=tiny", "experiment=stage2", "output_dir=x"])
     assert (cfg.preset, cfg.stage.name, cfg.output_dir) == ("tiny", "stage2", "x")
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        (["a/b.pt", "device=cpu"], ['file="a/b.pt"', "device=cpu"]),
+        (["--cfg", "job", "x y"], ["--cfg", "job", 'file="x y"']),
+        (["file=z.pt", "--help"], ["file=z.pt", "--help"]),
+    ],
+)
+def test_words_without_a_key_get_one(typed, meant):
+    assert name_positional(typed, "file") == meant

@@ -35,6 +35,11 @@ _RENAMED = (
 )
 """Settings of earlier versions as they were typed, and as they are typed now."""
 
+_WITH_VALUE = {
+    *("--cfg", "-c", "--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn", "--info", "-i"),
+}
+"""Hydra's options that a word of their own may follow."""
+
 _TYPED_FULL_ERROR = os.environ.get(_FULL_ERROR)
 
 
@@ -171,6 +176,22 @@ def quoted(path: Path) -> str:
     """Return a path as Hydra's override grammar wants it."""
     escaped = str(path).replace("\\", "\\\\").replace('"', '\\"')
     return f'"{escaped}"'
+
+
+def name_positional(words: Sequence[str], key: str) -> list[str]:
+    """Return the words of a command line, with ``key=`` before one that is neither a setting nor an option.
+
+    Args:
+        words: as typed.
+        key: setting that a word without a key means.
+    """
+    named: list[str] = []
+    before = ""
+    for word in words:
+        is_path = "=" not in word and not word.startswith("-") and before not in _WITH_VALUE
+        named.append(f"{key}={quoted(Path(word))}" if is_path else word)
+        before = word
+    return named
 
 
 def _exit_with(error: RaytranError) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Numbers that tell early whether a DETR-like network learns: gradients by part, how slots are used."""
+"""Early signs of whether a DETR-like network learns: gradients by part, how the query slots are used."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ def slot_signals(
 
     Returns:
         ``class_accuracy``: share of the slots matched with an object whose surest class is that object's;
-        missing where no scene has objects. It should soon leave that of guessing.
-        ``class_entropy``: entropy of a slot's classes, mean over slots, 1 if all are alike. Near 0 from the
-        start, slots are sure before they know.
-        ``slots_used``: share of the slots that say they hold an object. It should come to the mean number of
-        objects over that of slots; 0 for long, the padding class has won.
+        missing where no scene has objects. It should soon be better than that of guessing.
+        ``class_entropy``: entropy of a slot's class probabilities, mean over slots, 1 if all classes are
+        equally likely. Near 0 from the start it means that slots are confident without a reason.
+        ``slots_used``: share of the slots whose most likely class is an object's. It should approach the mean
+        number of objects over that of slots; if it stays 0, the padding class has won.
     """
     objects = RawObjects(**{name: value.float() for name, value in vars(objects).items()})
     right, matched = _count_right(objects, targets, matcher(objects, targets))
@@ -65,10 +65,10 @@ def _count_right(
 
 
 class RunningStatistics:
-    """The running means and variances of a network's batch norms, to be put back.
+    """A backup of the running means and variances of a network's batch norms.
 
-    They take in what is not finite during the forward pass, before anybody can skip the step, and would keep
-    it for good.
+    The forward pass updates them before anything can tell that the step must be skipped: a value that is not
+    finite would stay in them for good.
 
     Args:
         model: the network; batch norms in evaluation mode are left out.
@@ -78,14 +78,14 @@ class RunningStatistics:
         norms = [m for m in model.modules() if isinstance(m, _BatchNorm) and m.training]
         found = [(m.running_mean, m.running_var, m.num_batches_tracked) for m in norms]
         self._buffers = [buffer for buffers in found for buffer in buffers if buffer is not None]
-        self._kept = [buffer.clone() for buffer in self._buffers]
+        self._backup = [buffer.clone() for buffer in self._buffers]
 
-    def keep(self) -> None:
-        """Remember how they are."""
-        for kept, buffer in zip(self._kept, self._buffers, strict=True):
-            kept.copy_(buffer)
+    def save(self) -> None:
+        """Back them up."""
+        for saved, buffer in zip(self._backup, self._buffers, strict=True):
+            saved.copy_(buffer)
 
     def restore(self) -> None:
-        """Make them what they were when they were kept."""
-        for kept, buffer in zip(self._kept, self._buffers, strict=True):
-            buffer.copy_(kept)
+        """Set them to the backup."""
+        for saved, buffer in zip(self._backup, self._buffers, strict=True):
+            buffer.copy_(saved)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from html.parser import HTMLParser
 
 import pytest
 import torch
@@ -14,6 +15,31 @@ from raytran.run.train.fit import FitResult
 from raytran.structs import CLASSES, ObjectSet, SceneBatch, ScenePrediction, Views
 
 UPRIGHT = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+
+
+class Page(HTMLParser):
+    """Collects sources, links, and the text of a page, and checks that tags close in order."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.sources: list[str] = []
+        self.links: list[str] = []
+        self.text = ""
+        self.open: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        self.sources += [values["src"]] if "src" in values else []
+        self.links += [values["href"]] if "href" in values else []
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text += f" {data} " if not self.open or self.open[-1] != "style" else ""
 
 
 def metrics(n_good: int) -> dict:
@@ -84,7 +110,7 @@ def page(tmp_path) -> str:
         scenes=[scene("train", "scene0000_00", tmp_path), scene("val", "scene0001_00", tmp_path)],
         metrics={"train": metrics(5), "val": metrics(1)},
         fits=[fit],
-        seconds={"rooms": 3.0},
+        seconds={"rooms": 9.96, "training": 125.0},
     )
     assert path == tmp_path / "index.html"
     return re.sub(r"data:[^\"]+", "data:", path.read_text())
@@ -103,3 +129,16 @@ def test_pictures_and_files_are_there(page, tmp_path):
     assert 'href="predictions/scene0001_00/scene.glb"' in page
     assert (tmp_path / "predictions" / "scene0001_00" / "scene.glb").is_file()
     assert 'href="training/stage1/checkpoints/last.ckpt"' in page
+
+
+def test_the_page_says_everything_and_closes_its_tags(page):
+    parsed = Page(page)
+    assert parsed.open == []
+    flat = re.sub(r"\s+", " ", parsed.text)
+    for words in ("RayTran on generated rooms", "5 of 5", "1 of 5", "torch"):
+        assert words in flat
+    assert "rooms 10.0 s" in flat
+    assert "training 2 min 05 s" in flat
+    assert "all 2 min 15 s" in flat
+    assert "bathtub" not in flat, "a class that occurs nowhere has no row"
+    assert set(parsed.sources) == {"data:"}, "it stands alone"

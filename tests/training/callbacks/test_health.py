@@ -22,7 +22,7 @@ def overflow(module, first, last, call="conv1"):
         calls.append(None)
         return output * math.inf if first <= len(calls) <= last else output
 
-    (layer,) = (m for name, m in module.named_modules() if name == f"model.backbone.image_features.encoder.{call}")
+    (layer,) = (m for name, m in module.named_modules() if name.endswith(f".encoder.{call}"))
     layer.register_forward_hook(hook)
     return module
 

@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import json
 import logging
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,12 +19,11 @@ from rich.table import Table
 from raytran.checkpoints.file import shipped_weights
 from raytran.checkpoints.load import load_model, prediction_settings
 from raytran.checkpoints.network import own_packages
-from raytran.data.files import SettingsRecord
+from raytran.data.files import SettingsRecord, write_json
 from raytran.errors import ConfigError
 from raytran.model import RayTran
 from raytran.run.demo.page import COLUMNS, ShownScene, headline, write_page
-from raytran.run.demo.steps import StepTimes
-from raytran.run.entry import compose
+from raytran.run.entry import compose, quoted
 from raytran.run.evaluate.evaluate import TASKS_WITH_SHAPE, about_data, evaluate_model
 from raytran.run.evaluate.results import write_evaluation
 from raytran.run.predict.predict import predict_scene
@@ -47,8 +49,8 @@ _SETTINGS = (
 
 
 @dataclass(frozen=True)
-class Asked:
-    """A network, and the rooms it is asked about.
+class Evaluated:
+    """A network, and the rooms it is evaluated on.
 
     Attributes:
         model: the network.
@@ -90,7 +92,7 @@ def demo(cfg: DictConfig) -> DemoResult:
         ConfigError: the folder holds a demo with other settings.
     """
     output = Path(cfg.output).resolve()
-    overrides = [f"preset={cfg.preset}", f"data.root={_quoted(output / 'rooms')}", *plain(cfg.overrides)]
+    overrides = [f"preset={cfg.preset}", f"data.root={quoted(output / 'rooms')}", *plain(cfg.overrides)]
     data = _data(overrides, output)
     times = StepTimes(output / "times.json")
     with times.measure("rooms", continues=True):
@@ -113,7 +115,7 @@ def _data(overrides: Sequence[str], output: Path) -> SceneDataModule:
     Raises:
         ConfigError: ``output`` holds a demo with other settings.
     """
-    cfg = compose("train", [*overrides, *_SETTINGS, f"output_dir={_quoted(output)}"])
+    cfg = compose("train", [*overrides, *_SETTINGS, f"output_dir={quoted(output)}"])
     wanted = {
         name: value if isinstance(value := cfg[name], str | int) else plain(value) for name in _RECORDED
     }
@@ -133,13 +135,13 @@ def _train(overrides: Sequence[str], folder: Path, times: StepTimes) -> list[Fit
     return fits
 
 
-def _asked(overrides: Sequence[str], data: SceneDataModule, checkpoint: Path) -> dict[str, Asked]:
-    """Return who is asked about what, by ``COLUMNS``: the package's weights too, if it has any."""
+def _asked(overrides: Sequence[str], data: SceneDataModule, checkpoint: Path) -> dict[str, Evaluated]:
+    """Return networks and the rooms to evaluate them on, by ``COLUMNS``; shipped weights too, if any."""
     # The network was composed from what is typed here, not out of a file: its own classes are trusted.
     cfg = compose("train", [*overrides, *_SETTINGS, "output_dir=unused"])
     model = load_model(checkpoint, trust=own_packages(plain(cfg.model)))
     views = int(cfg.views.predict_views)
-    asked = {split: Asked(model, checkpoint, data, split, views) for split in ("train", "val")}
+    asked = {split: Evaluated(model, checkpoint, data, split, views) for split in ("train", "val")}
     shipped = shipped_weights()
     if shipped is not None:
         model, wanted = load_model(shipped), prediction_settings(shipped)
@@ -151,11 +153,11 @@ def _asked(overrides: Sequence[str], data: SceneDataModule, checkpoint: Path) ->
         }
         settings = [f"{name}={list(value)}" for name, value in fit.items()]
         cfg = compose("train", [*overrides, *_SETTINGS, *settings])
-        asked["shipped"] = Asked(model, shipped, build_data(cfg), "val", views)
+        asked["shipped"] = Evaluated(model, shipped, build_data(cfg), "val", views)
     return asked
 
 
-def _evaluate(cfg: DictConfig, asked: Asked, output: Path) -> dict[str, Any]:
+def _evaluate(cfg: DictConfig, asked: Evaluated, output: Path) -> dict[str, Any]:
     about = {"checkpoint": str(asked.checkpoint), **about_data(asked.data, asked.split, asked.num_views)}
     evaluation = evaluate_model(
         asked.model,
@@ -169,7 +171,7 @@ def _evaluate(cfg: DictConfig, asked: Asked, output: Path) -> dict[str, Any]:
     return evaluation.metrics
 
 
-def _predict_first(cfg: DictConfig, name: str, asked: Asked, output: Path) -> ShownScene:
+def _predict_first(cfg: DictConfig, name: str, asked: Evaluated, output: Path) -> ShownScene:
     """Predict the first of the rooms; write what ``raytran.predict`` writes, the truth in the plan."""
     batch = asked.data.split(asked.split)[0]
     scene = predict_scene(
@@ -199,7 +201,38 @@ def _tell(page: Path, metrics: Mapping[str, Mapping[str, Any]], seconds: Mapping
     console.print(f"Open {page}", soft_wrap=True)
 
 
-def _quoted(path: Path) -> str:
-    """Return a path as Hydra's override grammar wants it."""
-    escaped = str(path).replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'
+class StepTimes:
+    """Seconds per step of the demo, in the order of their first appearance, kept in a file over kills.
+
+    Args:
+        path: JSON file; what it holds is read first.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        try:
+            self.seconds: dict[str, float] = json.loads(path.read_text())
+        except (OSError, ValueError):
+            # Times are only shown, nothing depends on them.
+            self.seconds = {}
+
+    @contextmanager
+    def measure(self, name: str, *, continues: bool = False) -> Iterator[None]:
+        """Time a block and say so in the log.
+
+        Args:
+            name: of the step.
+            continues: the step goes on where a killed run left it, so times add up; else the last one counts.
+        """
+        _log.info("%s …", name)
+        began = time.monotonic()
+        try:
+            yield
+        finally:
+            self.add(name, time.monotonic() - began, continues=continues)
+        _log.info("%s: %.1f s", name, self.seconds[name])
+
+    def add(self, name: str, seconds: float, *, continues: bool = False) -> None:
+        """Enter the time of a step that was measured elsewhere."""
+        self.seconds[name] = seconds + (self.seconds.get(name, 0.0) if continues else 0.0)
+        write_json(self._path, self.seconds)

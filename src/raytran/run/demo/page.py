@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +13,12 @@ from PIL import Image
 
 from raytran.checkpoints.card import provenance
 from raytran.pictures.curves import draw_curves
+from raytran.pictures.page import data_uri
+from raytran.pictures.page import write_page as fill_template
+from raytran.pictures.palette import class_hex
 from raytran.pictures.panels import contact_sheet, draw_frames, draw_masks, draw_occupancy
-from raytran.pictures.report import Picture, Report, Section, SplitScores, write_report
 from raytran.run.train.fit import FitResult
-from raytran.structs import SceneBatch, ScenePrediction
+from raytran.structs import CLASSES, SceneBatch, ScenePrediction
 from raytran.training.loggers import read_history
 
 COLUMNS = {
@@ -25,6 +28,7 @@ COLUMNS = {
 }
 """What was asked → what a reader is told it is, in the order of the page."""
 
+_MEDIA = {".png": "image/png", ".jpg": "image/jpeg"}
 _STAGES = {"stage1": "1 · occupancy", "stage2": "2 · all but shape", "stage3": "3 · shape"}
 
 
@@ -73,88 +77,96 @@ def write_page(
 ) -> Path:
     """Draw the pictures into ``output/pictures`` and write ``output/index.html``.
 
+    The pictures become part of the page, so the file can be sent by itself.
+
     Args:
         output: folder of the demo.
         scenes: rooms to show.
         metrics: content of ``metrics.json`` by column.
         fits: of the stages, in order.
-        seconds: time of each step so far.
-
-    Returns:
-        The page.
+        seconds: time of each step.
     """
-    pictures = output / "pictures"
-    pictures.mkdir(parents=True, exist_ok=True)
-    histories = {_STAGES.get(fit.folder.name, fit.folder.name): read_history(fit.folder) for fit in fits}
-    curves = draw_curves(pictures / "curves.png", histories)
-    steps = ", ".join(f"{fit.steps:,}" for fit in fits)
-    training = Section(
-        "Training",
-        f"Three fits, one after another, of {steps} steps: first what is occupied, then everything but the "
-        "shapes, then the shapes alone while the rest is frozen.",
-        [
-            Picture(
-                curves, "Terms of the loss against steps: the running mean, and the values behind.", wide=True
-            )
-        ],
-    )
-    report = Report(
+    (output / "pictures").mkdir(parents=True, exist_ok=True)
+    splits = [_split(column, metrics) for column in metrics]
+    classes = [name for name in CLASSES if any(name in split["per_class"] for split in splits)]
+    found = provenance()
+    commit = {"commit": found["git_commit"]} if found["git_commit"] else {}
+    files = _files(output, scenes, fits)
+    return fill_template(
+        output / "index.html",
+        "demo.html.j2",
+        filters={"data_uri": _data_uri, "duration": _duration},
         title="RayTran on generated rooms",
-        summary=_summary(metrics),
-        splits=[_scores(column, metrics) for column in metrics],
-        sections=[*(_show(scene, pictures) for scene in scenes), training],
-        steps=seconds,
-        files=_files(output, scenes, fits),
-        versions=_versions(),
-    )
-    return write_report(output / "index.html", report)
-
-
-def _summary(metrics: Mapping[str, Mapping[str, Any]]) -> str:
-    counts = {column: metrics[column]["strict"]["n_scenes"] for column in ("train", "val")}
-    return (
-        "Rooms were generated, a small network was trained from scratch through the three stages of the "
-        f"paper, and then asked for the objects of the {counts['train']} training rooms and of "
-        f"{counts['val']} held-out ones: class, position, size, heading and mesh, from posed frames alone."
+        summary="Rooms were generated, a small network was trained from scratch through the three stages of "
+        f"the paper, and then asked for the objects of the {_scenes(metrics, 'train')} training rooms and of "
+        f"{_scenes(metrics, 'val')} held-out ones: class, position, size, heading and mesh, from posed "
+        "frames alone.",
+        splits=splits,
+        sections=[*(_room(scene, output / "pictures") for scene in scenes), _training(output, fits)],
+        classes=[(name, class_hex(CLASSES.index(name))) for name in classes],
+        seconds=seconds,
+        files={name: os.path.relpath(path, output) for name, path in files.items()},
+        versions={**found["versions"], **commit, "platform": found["platform"]},
     )
 
 
-def _scores(column: str, metrics: Mapping[str, Mapping[str, Any]]) -> SplitScores:
-    rooms = metrics["train"]["strict"]["n_scenes"]
+def _scenes(metrics: Mapping[str, Mapping[str, Any]], column: str) -> int:
+    return metrics[column]["strict"]["n_scenes"]
+
+
+def _split(column: str, metrics: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the scores on one set of rooms, and what they prove and what they do not."""
     meaning = {
         "train": "The network was trained on these very rooms. High numbers prove that the whole chain "
         "learns, from pixels to boxes and meshes; they say nothing about other rooms.",
-        "val": f"The network has never seen these rooms. So few training rooms (here {rooms}) cannot teach "
-        "what furniture looks like in general, so low numbers are expected; many more are needed for that.",
+        "val": "The network has never seen these rooms. So few training rooms (here "
+        f"{_scenes(metrics, 'train')}) cannot teach what furniture looks like in general, so low numbers are "
+        "expected; many more are needed for that.",
         "shipped": "The same held-out rooms, asked of the weights that come with raytran. They learned from "
         "a thousand other rooms on two CPU cores; docs/results.md tells what to expect of them.",
     }
     per_class = metrics[column]["strict"]["per_class"]
-    return SplitScores(
-        title=COLUMNS[column].capitalize(),
-        meaning=meaning[column],
-        numbers=headline(metrics[column]),
-        per_class={
+    return {
+        "title": COLUMNS[column].capitalize(),
+        "meaning": meaning[column],
+        "numbers": headline(metrics[column]),
+        "per_class": {
             name: (entry["n_good"], entry["n_total"]) for name, entry in per_class.items() if entry["n_total"]
         },
-    )
+    }
 
 
-def _show(scene: ShownScene, pictures: Path) -> Section:
+def _training(output: Path, fits: Sequence[FitResult]) -> dict[str, Any]:
+    """Return the section with the loss curves."""
+    histories = {_STAGES.get(fit.folder.name, fit.folder.name): read_history(fit.folder) for fit in fits}
+    steps = ", ".join(f"{fit.steps:,}" for fit in fits)
+    curves = draw_curves(output / "pictures" / "curves.png", histories)
+    return {
+        "title": "Training",
+        "text": f"Three fits, one after another, of {steps} steps: first what is occupied, then everything "
+        "but the shapes, then the shapes alone while the rest is frozen.",
+        "pictures": [
+            _picture(curves, "Terms of the loss against steps: running mean and single values.", wide=True)
+        ],
+    }
+
+
+def _room(scene: ShownScene, pictures: Path) -> dict[str, Any]:
+    """Return the section of a room: what ``write_scene`` drew, and the network's input and output."""
     batch, prediction = scene.batch, scene.prediction
     folder = pictures / scene.column
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     in_order = dict.fromkeys(scene.folder / "overlays" / f"{name}.jpg" for name in batch.frame_id[0])
     overlays = [Image.open(path) for path in in_order if path.is_file()]
     shown = [
-        Picture(
+        _picture(
             scene.folder / "topdown.png", "From above. Filled: predicted; dashed: true; arrow heads: fronts."
         ),
-        Picture(
+        _picture(
             contact_sheet(folder / "overlays.jpg", overlays, columns=2),
             "Predicted boxes and meshes over frames; the front face of a box is drawn bold.",
         ),
-        Picture(
+        _picture(
             draw_frames(folder / "frames.jpg", batch.views),
             "Some of the frames the network was given.",
             wide=True,
@@ -164,29 +176,40 @@ def _show(scene: ShownScene, pictures: Path) -> Section:
         truth = None if batch.foreground is None else batch.foreground[0]
         masks = draw_masks(folder / "masks.jpg", batch.views, prediction.foreground, truth, columns=2)
         caption = "Where objects are, also where others hide them. Orange: predicted; white line: true."
-        shown.append(Picture(masks, caption))
+        shown.append(_picture(masks, caption))
     if prediction.occupancy is not None:
         truth = None if batch.occupancy is None else batch.occupancy[0]
         height = scene.grid_extent[2]
         slices = draw_occupancy(folder / "occupancy.png", prediction.occupancy, truth, height=height)
-        shown.append(Picture(slices, "Occupied voxels in four layers; heights count from the mean camera."))
+        shown.append(_picture(slices, "Occupied voxels in four layers; heights count from the mean camera."))
     count = 0 if batch.objects is None else len(batch.objects[0])
-    found = f"{len(prediction.objects)} objects were predicted, {count} are there."
     kind = "training" if scene.column == "train" else "held-out"
     by = ", by raytran's own weights" if scene.column == "shipped" else ""
-    return Section(f"A {kind} room{by}: {prediction.scene_id}", found, shown)
+    return {
+        "title": f"A {kind} room{by}: {prediction.scene_id}",
+        "text": f"{len(prediction.objects)} objects were predicted, {count} are there.",
+        "pictures": shown,
+    }
+
+
+def _picture(path: Path, caption: str, *, wide: bool = False) -> dict[str, Any]:
+    return {"path": path, "caption": caption, "wide": wide}
 
 
 def _files(output: Path, scenes: Sequence[ShownScene], fits: Sequence[FitResult]) -> dict[str, Path]:
-    files = {f"3D scene of {s.folder.name} (glTF)": s.folder / "scene.glb" for s in scenes}
-    files |= {f"meshes of {s.folder.name} (PLY)": s.folder / "meshes" for s in scenes}
+    """Return what each file or folder holds → its path."""
+    files = {f"3D scene of {scene.folder.name} (glTF)": scene.folder / "scene.glb" for scene in scenes}
+    files |= {f"meshes of {scene.folder.name} (PLY)": scene.folder / "meshes" for scene in scenes}
     files["numbers by room and by object"] = output / "evaluation"
     files["trained network"] = fits[-1].checkpoint
     files["the rooms"] = output / "rooms"
     return files
 
 
-def _versions() -> dict[str, str]:
-    found = provenance()
-    commit = {"commit": found["git_commit"]} if found["git_commit"] else {}
-    return {**found["versions"], **commit, "platform": found["platform"]}
+def _data_uri(path: Path) -> str:
+    return data_uri(path.read_bytes(), _MEDIA[path.suffix])
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes else f"{seconds:.1f} s"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras to plan and to measure with: a made-up walk around a room, or the poses of a scan."""
+"""Cameras for plans and benchmarks: a synthetic walk around a room, or the poses of a scan."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder of a sweep, found again by the same command, and what its jobs left there.
+"""The folder of a sweep, found again by the same command, and the results that its jobs left there.
 
 A sweep lives in ``<outputs>/sweeps/<time>``, apart from single runs, so that ``init_from=auto`` never takes
 one of its jobs. ``sweep.json`` holds the command and, for each job, its settings and folder.
@@ -78,7 +78,7 @@ def write_record(
 
 
 def _command(program: str, overrides: Sequence[str]) -> list[str]:
-    """Return what makes two commands the same sweep; how many jobs run at a time does not."""
+    """Return what two commands must share to be one sweep: everything but how many jobs run at a time."""
     return [program, *sorted(item for item in overrides if not item.lstrip("+").startswith("launcher."))]
 
 
@@ -114,7 +114,7 @@ def register_sweep_resolver() -> None:
 
 
 def _folder_of_this_sweep(outputs: str, resume: str, program: str, overrides: Sequence[str]) -> str:
-    """Return one folder for all processes of a sweep: a queue's job asks again, hours later, elsewhere."""
+    """Return one folder for all processes of a sweep: a queue may start a job hours later elsewhere."""
     if THIS_SWEEP not in os.environ:
         os.environ[THIS_SWEEP] = str(Path(sweep_folder(outputs, resume, program, overrides)).absolute())
     return os.environ[THIS_SWEEP]

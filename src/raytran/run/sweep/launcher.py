@@ -260,21 +260,22 @@ def write_results(folder: Path, jobs: Sequence[Job]) -> dict[int, float | None]:
     What has finished is read from the jobs' folders, whichever call has run it.
 
     Returns:
-        The last value of its metric, or None, for each of ``jobs`` by number.
+        The last value of its metric, or None, for each job by number.
     """
     status = {job.number: job.status for job in jobs}
     metric = str(jobs[0].config.optimized_metric) if jobs else ""
     rows: list[dict[str, object]] = []
+    values: dict[int, float | None] = {}
     for number, recorded in enumerate(read_record(folder)["jobs"]):
         mark = read_finished(folder / recorded["folder"])
-        value = _value(number, folder / recorded["folder"], metric) if mark else None
+        values[number] = _value(number, folder / recorded["folder"], metric) if mark else None
         rows.append(
             dict(item.partition("=")[::2] for item in recorded["overrides"])
             | {
                 "job": number,
                 "status": FINISHED if mark else status.get(number, NOT_STARTED),
                 "metric": metric,
-                "value": value,
+                "value": values[number],
                 "steps": mark.steps if mark else None,
                 "folder": recorded["folder"],
             }
@@ -289,7 +290,7 @@ def write_results(folder: Path, jobs: Sequence[Job]) -> dict[int, float | None]:
     varied = [name for name in settings if len({row.get(name) for row in rows}) > 1]
     for row in rows:
         _log.info("job %s: %s", row["job"], _line(row, varied))
-    return {int(str(row["job"])): value for row in rows if isinstance(value := row["value"], float | None)}
+    return values
 
 
 def _value(number: int, folder: Path, metric: str) -> float | None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which settings to change when the memory does not suffice."""
+"""Names the settings to change when memory runs out."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SAVING = {
     "model.backbone.checkpoint_blocks": "true computes the blocks twice instead of keeping them",
     "views.image_size": "smaller images",
 }
-"""Setting → what changing it does, dearest to the result last."""
+"""What changing each setting does, in order: those that change the result least come first."""
 
 
 @contextmanager
@@ -34,13 +34,13 @@ def explained_out_of_memory(cfg: DictConfig) -> Iterator[None]:
         where = _place(error)
         if where is None:
             raise
-        # The frames of the failed step hold its tensors: let them go before anything else is done.
+        # The traceback's frames hold the tensors of the failed step: free them first.
         error.__traceback__ = None
         raise ConfigError(f"{where} does not suffice for a step: change {_advice(cfg)}") from None
 
 
 def _place(error: BaseException) -> str | None:
-    """Return which memory was too small, None if that was not the trouble."""
+    """Return which memory was too small, None if the error is another one."""
     if isinstance(error, torch.OutOfMemoryError):
         return "the memory of the GPU"
     if isinstance(error, MemoryError) or "DefaultCPUAllocator" in str(error):
@@ -49,7 +49,7 @@ def _place(error: BaseException) -> str | None:
 
 
 def _advice(cfg: DictConfig) -> str:
-    """Name the settings that still have something to give."""
+    """Name the settings that can still save memory."""
     found = []
     for name, effect in _SAVING.items():
         now = OmegaConf.select(cfg, name)

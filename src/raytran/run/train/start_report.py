@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a stage is about to do: what trains, what is frozen, which terms count, where it starts."""
+"""What a fit logs at its start: what trains, what is frozen, which loss terms count, where it starts from."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def start_report(
         stage: the stage; it is applied to ``model``, as the fit will do.
         model: the network.
         card: what the checkpoints will say of themselves, see ``checkpoint_card``.
-        trust: packages of which the user knows that the checkpoints need them to be trusted.
+        trust: packages that the user has already named as trusted.
     """
     stage.freeze(model)
     trained: dict[str, int] = {}

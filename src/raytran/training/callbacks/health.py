@@ -61,7 +61,7 @@ class Health(pl.Callback):
     ) -> None:
         """Remember the running statistics at the first batch of a step."""
         if batch_idx % trainer.accumulate_grad_batches == 0 and self._statistics is not None:
-            self._statistics.keep()
+            self._statistics.save()
 
     def on_before_backward(self, trainer: pl.Trainer, pl_module: pl.LightningModule, loss: Tensor) -> None:
         """Add up this rank's losses of the batches of a step: an infinite one may have finite gradients."""

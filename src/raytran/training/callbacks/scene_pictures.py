@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of the same scenes at every validation, in the run's folder and in the loggers that take any."""
+"""Pictures of the same scenes after every validation, in the run's folder and in loggers that show images."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _log = logging.getLogger(__name__)
 class ScenePictures(pl.Callback):
     """Draws a few validation scenes, spread evenly over the split, after every validation.
 
-    The first rank alone predicts and draws them; the others wait for it at the next step. Files go to
+    The first rank alone predicts and draws them; the other ranks wait for it in the next step. Files go to
     ``<folder>/step-000300/<scene>``. TensorBoard gets the images; W&B those, the boxes in 3D, and a table of
     predicted and true objects.
 
@@ -60,7 +60,7 @@ class ScenePictures(pl.Callback):
             _log.warning("no pictures of step %d (%s): make room in %s", step, error.strerror, self._folder)
             return
         except (ValueError, ArithmeticError, QhullError) as error:
-            # Boxes without extent, say, early on: no reason to end a run.
+            # Early in training boxes may have no extent, for instance: no reason to end a run.
             _log.warning("no pictures of step %d: %s", step, str(error).splitlines()[0])
             return
         logged_at = step - 1  # where Lightning, which counts logged steps from 0, puts the scores
@@ -72,7 +72,7 @@ class ScenePictures(pl.Callback):
 
     @torch.no_grad()
     def _predict(self, module: Reconstruction, dataset: Any) -> list[tuple[SceneBatch, ScenePrediction]]:
-        """Return the scenes, always the same ones, and what the network makes of them now."""
+        """Return the scenes, always the same ones, and the network's present predictions for them."""
         chosen = dict.fromkeys(choose_even(len(dataset), min(self._scenes, len(dataset))).tolist())
         stage, found = module.stage, []
         for index in chosen:
@@ -92,11 +92,11 @@ class ScenePictures(pl.Callback):
         step: int,
         grid_extent: tuple[float, float, float],
     ) -> dict[str, Path]:
-        """Return name of each picture, ``<scene>/masks`` and so on → its file."""
+        """Return the file of each picture by name, ``<scene>/masks`` and so on."""
         final = self._folder / f"step-{step:06d}"
         self._folder.mkdir(parents=True, exist_ok=True)
         if final.is_dir():
-            shutil.rmtree(final)  # of a validation that a resumed run does again
+            shutil.rmtree(final)  # a resumed run repeats this validation
         pictures: dict[str, Path] = {}
         with finished_folder(final) as folder:
             for batch, prediction in found:

@@ -27,7 +27,7 @@ class StepProgress(pl.Callback):
     """A rich bar on a terminal, ten lines in a log file.
 
     Args:
-        title: what to write before the bar.
+        title: text before the bar.
     """
 
     def __init__(self, title: str) -> None:
@@ -54,7 +54,7 @@ class StepProgress(pl.Callback):
         self._bar.start()
 
     def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *_: Any) -> None:
-        """Move on."""
+        """Show the steps done and the loss."""
         if self._bar is not None:
             self._bar.update(self._task, completed=trainer.global_step, loss=_loss(trainer))
         elif trainer.is_global_zero and trainer.global_step - self._shown_at >= max(

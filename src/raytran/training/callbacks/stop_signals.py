@@ -67,9 +67,9 @@ class StopSignals:
         """Return the number of the signal that some rank has received, 0 if none has."""
         if self._group is None:
             return self._received
-        heard = torch.tensor([self._received])
-        dist.all_reduce(heard, dist.ReduceOp.MAX, group=self._group)
-        return int(heard)
+        received = torch.tensor([self._received])
+        dist.all_reduce(received, dist.ReduceOp.MAX, group=self._group)
+        return int(received)
 
     def gather(self, value: object) -> list[object]:
         """Return ``value`` of every rank, in their order."""

@@ -5,15 +5,15 @@ from __future__ import annotations
 
 import pytest
 
-from raytran.run.demo import steps
-from raytran.run.demo.steps import StepTimes
+from raytran.run.demo import demo
+from raytran.run.demo.demo import StepTimes
 
 
 @pytest.fixture
 def clock(monkeypatch):
     """A clock that the test moves by hand."""
     now = [100.0]
-    monkeypatch.setattr(steps.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(demo.time, "monotonic", lambda: now[0])
     return now
 
 
