@@ -74,7 +74,7 @@ def test_ranks_share_the_batch_norms_of_voxels_too(steps, tmp_path, command):
     done = command("train", *arguments, folder=tmp_path)
     assert done.returncode == 0, done.stderr
     state = torch.load(tmp_path / "run" / LAST, weights_only=True)["state_dict"]
-    assert int(state["model.backbone.volume.down.0.0.bn1.num_batches_tracked"]) == STEPS
+    assert int(state["model.backbone.voxel_network.down.0.0.bn1.num_batches_tracked"]) == STEPS
 
 
 @pytest.mark.slow
