@@ -163,7 +163,7 @@ FUNCTIONS = {
     "object_meshes": meshed,
 }
 
-SOME_FOLDERS = ("geometry", "ops", "backbone", "heads", "losses")
+SOME_FOLDERS = ("geometry", "ops", "backbone", "heads", "extensions", "losses")
 
 COPIES = {
     "geometry/box_clip.py": {"_face_edges", "_crossings", "_clamped_flux"},
@@ -172,9 +172,9 @@ COPIES = {
     "geometry/rotation.py": {"upright_basis"},
     "geometry/volumes.py": {"_offset", "corner_index"},
     "heads/queries.py": {"forward"},
-    "losses/denoising.py": {"denoising_losses"},
+    "extensions/denoising.py": {"denoising_losses"},
     "losses/matcher.py": {"_match"},
-    "losses/pose.py": {"yaw_from_vector"},
+    "losses/objects.py": {"yaw_from_vector"},
     "losses/total.py": {"_divisors"},
     "ops/traverse.py": {"_clip"},
 }
@@ -182,7 +182,7 @@ COPIES = {
 
 ON_THE_CPU = {
     "geometry/volumes.py": {"cover", "_along_axis"},
-    "ops/rasterize.py": {"rasterize_mask", "rasterize_ids", "near_pixels", "_clip_to_front"},
+    "geometry/rasterize.py": {"rasterize_mask", "rasterize_ids", "near_pixels", "_clip_to_front"},
 }
 """Functions that make tensors on the CPU, and return them there."""
 

@@ -67,7 +67,7 @@ def importable(lab, monkeypatch):
 
 
 def test_two_stages_train_and_say_what_is_needed(fits, checkpoint):
-    line = "this network has classes of mylab: to use its checkpoints, evaluate, predict, export_model and "
+    line = "this network has classes of mylab: to use its checkpoints, evaluate, predict and export_model "
     said = [fit.stdout + fit.stderr for fit in fits]
     assert line in said[0]
     assert "need trust=[mylab]" in said[0]

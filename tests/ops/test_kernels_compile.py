@@ -36,7 +36,10 @@ def compiled(capability: int, cases: tuple[str, ...]) -> list[dict]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("capability", CAPABILITIES)
+@pytest.mark.parametrize(
+    "capability",
+    [pytest.param(each, marks=pytest.mark.nightly if each != 90 else ()) for each in CAPABILITIES],
+)
 def test_paper_sizes_compile_once_for_any_number_of_views_and_spill_nothing(capability):
     found = compiled(capability, PAPER)
     counts = Counter(kernel["kernel"] for kernel in found)
