@@ -99,7 +99,7 @@ VARIATIONS = {
     "torch.sparse": ("stage2", "tiny", ["model.attention=sparse"], (3,)),
     "frozen norms, one direction": (
         *("stage2", "tiny"),
-        ["model.backbone.bidirectional=false", "model.backbone.start_levels=2", "stage.freeze_norms=true"],
+        ["model.backbone.bidirectional=false", "model/extensions=[unet3d]", "stage.freeze_norms=true"],
         (3,),
     ),
 }

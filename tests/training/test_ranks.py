@@ -35,7 +35,7 @@ RUNS = {
     "stage1": ("experiment=stage1",),
     "stage2": ("experiment=stage2",),
     "stage3": ("experiment=stage3",),
-    "voxels normalised": ("experiment=stage1", "model.backbone.start_levels=2"),
+    "voxels normalised": ("experiment=stage1", "model/extensions=[unet3d]"),
     "no attention": ("experiment=stage1", "variant=unprojection"),
 }
 """The runs that ranks are compared in, and their settings."""

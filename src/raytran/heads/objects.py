@@ -9,6 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from raytran.errors import ConfigError
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.position import position_code
 from raytran.geometry.rotation import rotation_from_yaw
@@ -53,6 +54,9 @@ class ObjectHead(nn.Module):
         voxel_attention: what queries read the voxels with, see ``DecoderLayer``.
         refinement: from what a layer started from and what it predicts to what the next one starts from; None
             for ``CenterRefinement``.
+
+    Raises:
+        ConfigError: queries are named by a word.
     """
 
     extent: Tensor
@@ -71,6 +75,11 @@ class ObjectHead(nn.Module):
         refinement: nn.Module | None = None,
     ) -> None:
         super().__init__()
+        if isinstance(queries, str):
+            raise ConfigError(
+                f"model.heads.objects.queries={queries} is no module: "
+                "choose model/extensions=[proposal_queries], or queries=null for learned ones"
+            )
         self.grid_extent = tuple(float(length) for length in grid_extent)
         self.register_buffer("extent", torch.tensor(self.grid_extent), persistent=False)
         self.queries = (

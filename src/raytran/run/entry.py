@@ -31,6 +31,14 @@ _RENAMED = (
     (r"experiment=(gt_masks|unprojection)_(\w+)", r"variant=\1 experiment=\2"),
     (r"experiment=frames_(\d+)", r"num_views=\1"),
     (r"experiment=objects_(\d+)", r"max_objects=\1"),
+    (r"model\.backbone\.resnet\.", "model.backbone.encoder."),
+    (r"model\.backbone\.norm_momentum=", "norm_momentum="),
+    (r"model\.backbone\.start_levels=.*", "model/extensions=[unet3d]"),
+    (r"model\.heads\.objects\.windowed=.*", "model/extensions=[windowed_attention]"),
+    (r"model\.heads\.objects\.refines=.*", "model/extensions=[box_refinement]"),
+    (r"model\.heads\.objects\.num_copies=.*", "model/extensions=[denoising]"),
+    (r"model=unprojection", "model/backbone=unprojection"),
+    (r"model/encoder=(tiny|small|raytran)", "model/encoder=resnet18"),
     *((rf"(stage=|schedule\.){old}\b", rf"\g<1>{new}") for old, new in STAGE_NAMES.items()),
 )
 """Settings of earlier versions as they were typed, and as they are typed now."""
