@@ -82,7 +82,7 @@ def parts_of_a_sample(root: Path, cache_dir: Path, rounds: int) -> dict[str, flo
     (objects,) = sample.objects or ()
     scan = read_scan(root / "scannet" / "scans" / sample.scene_id[0])
     chosen = choose_even(len(scan), NUM_VIEWS).tolist()
-    cameras = Cameras(sample.views.intrinsics[0], sample.views.world_from_camera[0], IMAGE_SIZE)
+    cameras = Cameras.of(sample.views.scene())
     grid = VoxelGrid(resolution=(48, 48, 16), extent=(9.0, 9.0, 3.5), center=sample.grid_center[0])
     where = {"shapenet_root": root / "shapenet", "cache": MaskCache(folder=cache_dir)}
     candidates: dict[str, Callable[[], object]] = {

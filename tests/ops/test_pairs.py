@@ -16,14 +16,14 @@ def _pairs() -> PairList:
 
 
 def test_order_by_pixels_and_by_voxels_by_hand():
-    offsets, cols, turn = _pairs().by("pixels")
+    offsets, cols, permutation = _pairs().by("pixels")
     assert offsets.tolist() == [0, 2, 2, 5, 5]
     assert cols.tolist() == [1, 4, 0, 1, 3]
-    assert turn.tolist() == [1, 4, 0, 2, 3]
-    offsets, cols, turn = _pairs().by("voxels")
+    assert permutation.tolist() == [1, 4, 0, 2, 3]
+    offsets, cols, permutation = _pairs().by("voxels")
     assert offsets.tolist() == [0, 1, 3, 3, 4, 5]
     assert cols.tolist() == [2, 0, 2, 2, 0]
-    assert turn.tolist() == [2, 0, 3, 4, 1]
+    assert permutation.tolist() == [2, 0, 3, 4, 1]
 
 
 def test_orders_are_made_once_and_are_no_part_of_the_struct():

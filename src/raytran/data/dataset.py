@@ -187,7 +187,7 @@ class SceneDataset(Dataset[SceneBatch]):
         self, scan: Scan, views: Views, used: Sequence[int], seen: Sequence[int], objects: ObjectSet
     ) -> SceneBatch:
         """Return all N + V frames of a scene before augmentation, with all objects and the masks."""
-        cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], self._image_size)
+        cameras = Cameras.of(views.scene())
         foreground = self._foreground(objects, cameras)
         mask = self._visible(objects, cameras, scan) if self._input_mask == "visible" else foreground
         if self._input_mask is not None and mask is not None:
@@ -239,7 +239,7 @@ class SceneDataset(Dataset[SceneBatch]):
         if not wanted or self._shapenet_root is None or scene.objects is None:
             return None
         views = scene.views.select(torch.tensor(seen))
-        cameras = Cameras(views.intrinsics[0], views.world_from_camera[0], self._image_size)
+        cameras = Cameras.of(views.scene())
         (objects,), root = scene.objects, self._shapenet_root
         return seen_objects(objects, cameras, shapenet_root=root, cache=self._cache).any(dim=0)
 

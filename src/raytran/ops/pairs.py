@@ -37,13 +37,13 @@ class PairOrder(NamedTuple):
     Attributes:
         row_offsets: ``(rows + 1,)`` int32; the pairs of row ``r`` are ``row_offsets[r]:row_offsets[r + 1]``.
         col_index: ``(P,)`` int32, the other side of each pair, rising within a row.
-        turn: ``(P,)`` int64, the place of each pair in the order by the other side: ``values[turn]`` brings
-            values from that order into this one.
+        permutation: ``(P,)`` int64, the place of each pair in the order by the other side:
+            ``values[permutation]`` brings values from that order into this one.
     """
 
     row_offsets: Tensor
     col_index: Tensor
-    turn: Tensor
+    permutation: Tensor
 
 
 @dataclass(frozen=True)
@@ -119,10 +119,10 @@ class PairList(TensorStruct):
         return BlockPairs.from_index(self.pixel_index, self.voxel_index, pixels, voxels)
 
     def _order_by_pixels(self) -> PairOrder:
-        place = self.by("voxels").turn
-        turn = torch.empty_like(place)
-        turn[place] = torch.arange(place.shape[0], device=place.device)
-        return PairOrder(_offsets(self.pixel_index, self.num_pixels), self.voxel_index.int(), turn)
+        place = self.by("voxels").permutation
+        permutation = torch.empty_like(place)
+        permutation[place] = torch.arange(place.shape[0], device=place.device)
+        return PairOrder(_offsets(self.pixel_index, self.num_pixels), self.voxel_index.int(), permutation)
 
     def _order_by_voxels(self) -> PairOrder:
         # Stable, so that pixels rise within a voxel and the order of every sum is fixed.

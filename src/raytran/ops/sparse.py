@@ -93,18 +93,20 @@ def _attend_backward(
     """Return the gradients of query, key and value; ``saved`` are these and what ``_attend`` returned."""
     query, key, value, out, exponentials, sums = saved
     target_order, source_order = PairOrder(*by_target), PairOrder(*by_source)
-    scale, row, turn = query.shape[2] ** -0.5, row_of_pair(target_order), source_order.turn
+    scale = query.shape[2] ** -0.5
+    row = row_of_pair(target_order)
+    permutation = source_order.permutation
     inverse = _inverse(sums)
     # The softmax's own gradient: w · (g - Σ w g), with g = ∂/∂w; the sum is that of out · ∂out.
     mean = (grad * out).sum(dim=2).mul_(inverse)
     d_query, d_key, d_value = (tensor.new_empty(tensor.shape) for tensor in (query, key, value))
     for head, exponential in enumerate(exponentials):
         of_head = grad[:, head] * inverse[:, head, None]
-        d_value[:, head] = sparse_product(exponential.index_select(0, turn), of_head, source_order)
+        d_value[:, head] = sparse_product(exponential.index_select(0, permutation), of_head, source_order)
         d_score = sampled_product(of_head, value[:, head].contiguous(), target_order)
         d_score.sub_(mean[:, head].index_select(0, row)).mul_(exponential).mul_(scale)
         d_query[:, head] = sparse_product(d_score, key[:, head], target_order)
-        d_key[:, head] = sparse_product(d_score.index_select(0, turn), query[:, head], source_order)
+        d_key[:, head] = sparse_product(d_score.index_select(0, permutation), query[:, head], source_order)
     return d_query, d_key, d_value
 
 
