@@ -33,12 +33,13 @@ from raytran.errors import CheckpointError, ConfigError
 
 _log = logging.getLogger(__name__)
 
+BEST_NAME = "best.ckpt"
 LAST_NAME = "last.ckpt"
 PREVIOUS_NAME = "previous.ckpt"
 
 
 def write_checkpoint(path: Path, content: dict[str, Any]) -> None:
-    """Write ``content`` to ``path`` and keep what was there as ``previous.ckpt``.
+    """Write ``content`` to ``path``; a ``last.ckpt`` that was there is kept as ``previous.ckpt``.
 
     A kill at any moment leaves the old file or the new one under either name, whole.
 
@@ -68,7 +69,7 @@ def _link_previous(path: Path, previous: Path) -> Path | None:
     Both ``path`` and ``previous`` so exist throughout. None if there is nothing to keep, or if the file
     system has no links: then ``path`` has become ``previous`` already.
     """
-    if not path.is_file() or path == previous:
+    if not path.is_file() or path.name != LAST_NAME:
         return None
     link = previous.with_name(f"{UNFINISHED}{previous.name}")
     link.unlink(missing_ok=True)

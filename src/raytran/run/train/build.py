@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 import lightning.pytorch as pl
 import torch
 from hydra.utils import instantiate
-from lightning.pytorch.callbacks import LearningRateMonitor, TQDMProgressBar
+from lightning.pytorch.callbacks import EarlyStopping, LearningRateMonitor, ModelCheckpoint, TQDMProgressBar
 from omegaconf import DictConfig, OmegaConf
 
+from raytran.checkpoints.file import BEST_NAME
 from raytran.checkpoints.network import without_sources
 from raytran.checkpoints.runs import LAST
 from raytran.errors import ConfigError
@@ -113,7 +114,9 @@ def build_trainer(cfg: DictConfig, run: RunConfig, card: dict[str, Any], stage: 
         RepeatedFramesWarning(),
         LastCheckpoint(folder / LAST, every_n_steps=run.checkpoint_every, card=card),
         *_monitors(cfg, folder, card["config"]),
+        *_judges(cfg, folder),
     ]
+    settings["enable_checkpointing"] = any(isinstance(callback, ModelCheckpoint) for callback in callbacks)
     if run.progress_bar == "rich":
         callbacks.append(StepProgress(card["stage"]))
     elif run.progress_bar == "tqdm":
@@ -128,6 +131,34 @@ def build_trainer(cfg: DictConfig, run: RunConfig, card: dict[str, Any], stage: 
         enable_progress_bar=run.progress_bar == "tqdm",
         _convert_="all",
     )
+
+
+def _judges(cfg: DictConfig, folder: Path) -> list[pl.Callback]:
+    """Return Lightning's callbacks that keep the best weights, and end a run that gets no better.
+
+    Raises:
+        ConfigError: a setting has no meaning.
+    """
+    metric, mode, patience = cfg.optimized_metric, cfg.optimized_mode, cfg.early_stopping.patience
+    if metric is None:
+        return []
+    if mode not in ("max", "min"):
+        raise ConfigError(f"unknown optimized_mode={mode}: choose max or min")
+    if not isinstance(patience, int) or patience < 0:
+        raise ConfigError(
+            f"early_stopping.patience must be a number of validations or 0 for never, got {patience}"
+        )
+    best = ModelCheckpoint(
+        dirpath=(folder / LAST).parent,
+        filename=Path(BEST_NAME).stem,
+        monitor=metric,
+        mode=mode,
+        enable_version_counter=False,
+        save_on_train_epoch_end=False,
+    )
+    if not patience:
+        return [best]
+    return [best, EarlyStopping(metric, mode=mode, patience=patience, check_on_train_epoch_end=False)]
 
 
 def _monitors(cfg: DictConfig, folder: Path, settings: dict[str, Any]) -> list[pl.Callback]:
