@@ -26,7 +26,7 @@ import raytran
 if TYPE_CHECKING:
     import lightning.pytorch as pl
 
-    from raytran.ops.tracer import Attention
+    from raytran.ops.traverse import Attention
 
 Run = Callable[[], object]
 

@@ -21,7 +21,7 @@ from step import load_of
 from timing import MEBIBYTE, print_machine, reason
 
 from raytran.geometry.camera import Cameras
-from raytran.ops.tracer import RayTracer
+from raytran.ops.traverse import RayTracer
 from raytran.run.entry import compose
 from raytran.run.plan.dry_run import dry_prediction
 from raytran.run.plan.plan import FIXED, SCRATCH

@@ -30,7 +30,7 @@ from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.ops.pairs import PairList, listed
 from raytran.ops.ray_attention import Direction, ray_attention
-from raytran.ops.tracer import RayTracer
+from raytran.ops.traverse import RayTracer
 from raytran.ops.triton.block_pairs import BlockPairs
 from raytran.run.plan.roofline import measure_ceilings
 

@@ -38,7 +38,7 @@ from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.model import RayTran
 from raytran.ops.pairs import listed
-from raytran.ops.tracer import RayTracer
+from raytran.ops.traverse import RayTracer
 from raytran.run.plan.dry_run import Load, dry_training
 from raytran.run.plan.plan import FIXED, SCRATCH
 from raytran.run.plan.roofline import Ceilings, measure_ceilings

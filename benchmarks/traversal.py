@@ -13,7 +13,7 @@ from timing import MEBIBYTE, Run, measure, print_machine
 
 from raytran.geometry.camera import Cameras
 from raytran.ops.pairs import PairList, listed
-from raytran.ops.tracer import RayTracer
+from raytran.ops.traverse import RayTracer
 
 
 def tracers(

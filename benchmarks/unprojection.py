@@ -22,7 +22,7 @@ from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.ops.ray_attention import ray_attention
 from raytran.ops.splat import splat_features
-from raytran.ops.tracer import RayTracer
+from raytran.ops.traverse import RayTracer
 
 HEADS, CHANNELS = 8, 256
 

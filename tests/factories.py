@@ -18,7 +18,7 @@ from raytran.extensions.denoising import DenoisingObjectHead
 from raytran.extensions.proposal_queries import ProposalQueries
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.heads.dense import ForegroundHead, OccupancyHead
+from raytran.heads.auxiliary import ForegroundHead, OccupancyHead
 from raytran.heads.objects import ObjectHead
 from raytran.heads.shape import ShapeHead
 from raytran.heads.view import ViewHead

@@ -16,6 +16,7 @@ from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.position import position_code, ray_code
 from raytran.geometry.rasterize import rasterize_mask
+from raytran.geometry.room_tiles import Volumes, cover
 from raytran.geometry.rotation import (
     geodesic_angle,
     matrix_from_quaternion,
@@ -25,7 +26,6 @@ from raytran.geometry.rotation import (
     upright_basis,
     yaw_from_rotation,
 )
-from raytran.geometry.volumes import Volumes, cover
 from raytran.metrics.functional.alignment import alignment_errors
 from raytran.metrics.functional.detection import average_precision, best_f1, match_in_order, score_order
 from raytran.metrics.functional.shape import chamfer_distance, surface_points
@@ -170,7 +170,7 @@ COPIES = {
     "geometry/boxes.py": {"corners"},
     "geometry/position.py": {"position_code"},
     "geometry/rotation.py": {"upright_basis"},
-    "geometry/volumes.py": {"_offset", "corner_index"},
+    "geometry/room_tiles.py": {"_offset", "corner_index"},
     "heads/queries.py": {"forward"},
     "extensions/denoising.py": {"denoising_losses"},
     "losses/matcher.py": {"_match"},
@@ -181,7 +181,7 @@ COPIES = {
 """Functions that copy Python's numbers to the device, for which the host waits: not to be added to."""
 
 ON_THE_CPU = {
-    "geometry/volumes.py": {"cover", "_along_axis"},
+    "geometry/room_tiles.py": {"cover", "_along_axis"},
     "geometry/rasterize.py": {"rasterize_mask", "rasterize_ids", "near_pixels", "_clip_to_front"},
 }
 """Functions that make tensors on the CPU, and return them there."""

@@ -28,10 +28,10 @@ from raytran.checkpoints.runs import LAST
 from raytran.data.collate import collate_scenes
 from raytran.errors import NonFiniteError
 from raytran.geometry.camera import Cameras
+from raytran.geometry.room_tiles import Volumes
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.geometry.volumes import Volumes
 from raytran.metrics.per_scene import SceneMetric
-from raytran.ops.tracer import RayTracer
+from raytran.ops.traverse import RayTracer
 from raytran.ops.triton import block_pairs
 from raytran.run.entry import compose
 from raytran.run.evaluate.evaluate import TASKS_WITH_SHAPE, evaluate_model

@@ -8,9 +8,9 @@ import torch
 
 from raytran.backbone.backbone import Backbone
 from raytran.backbone.resnet import ResNet18
-from raytran.heads.dense import ForegroundHead, OccupancyHead
+from raytran.heads.auxiliary import ForegroundHead, OccupancyHead
 from raytran.model import RayTran
-from raytran.ops.tracer import RayTracer
+from raytran.ops.traverse import RayTracer
 from raytran.ops.triton import block_pairs
 from raytran.ops.triton.block_pairs import BlockPairs
 from raytran.structs import RawScene, Views

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from raytran.geometry.room_tiles import Volumes
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.geometry.volumes import Volumes
 from raytran.postprocess import count_object_views, merge_volumes, object_meshes, select_objects
 from raytran.structs import ObjectSet, ScenePrediction
 

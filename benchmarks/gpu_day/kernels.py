@@ -17,8 +17,7 @@ from raytran.ops import reference
 from raytran.ops.pairs import listed
 from raytran.ops.ray_attention import Direction, ray_attention
 from raytran.ops.splat import splat_features
-from raytran.ops.tracer import RayTracer
-from raytran.ops.traverse import trace_pairs
+from raytran.ops.traverse import RayTracer, trace_pairs
 from raytran.ops.triton import block_pairs
 from raytran.ops.triton.block_pairs import BlockPairs
 from raytran.run.plan.camera_paths import walk

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from gpu_day.context import Context
 from raytran.model import inputs_of
-from raytran.ops.tracer import Attention, RayTracer
+from raytran.ops.traverse import Attention, RayTracer
 from raytran.run.plan.camera_paths import walk
 from raytran.run.train.build import build_model, build_module
 from raytran.structs import SceneBatch
-from raytran.training.reconstruction import Reconstruction
+from raytran.training.lightning_module import Reconstruction
 
 LOSS_TOLERANCE = 1e-4
 """Of each loss term, over its size. Weights changed in their last bit change losses by 3e-7 at most (four

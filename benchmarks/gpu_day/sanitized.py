@@ -14,7 +14,7 @@ from camera_path import paper_grid
 from raytran.geometry.camera import Cameras
 from raytran.ops.ray_attention import ray_attention
 from raytran.ops.splat import splat_features
-from raytran.ops.tracer import RayTracer
+from raytran.ops.traverse import RayTracer
 from raytran.run.plan.camera_paths import walk
 
 

@@ -21,8 +21,7 @@ from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.heads.objects import ObjectOutputs, objects_of_queries
 from raytran.ops.pairs import Pairs
-from raytran.ops.tracer import Attention, RayTracer
-from raytran.ops.traverse import count_views
+from raytran.ops.traverse import Attention, RayTracer, count_views
 from raytran.structs import ObjectSet, RawScene, SceneBatch, ScenePrediction, Views
 
 TASKS = ("occupancy", "foreground", "objects")

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from raytran.geometry.boxes import OrientedBoxes, box_iou
 from raytran.geometry.grid import VoxelGrid
-from raytran.geometry.volumes import Volumes
+from raytran.geometry.room_tiles import Volumes
 from raytran.structs import ObjectSet, ScenePrediction
 
 SCORE_THRESHOLD = 0.5

@@ -10,7 +10,7 @@ import torch
 
 from raytran.errors import ConfigError
 from raytran.training import datamodule
-from raytran.training.reconstruction import Reconstruction
+from raytran.training.lightning_module import Reconstruction
 
 from .runs import fit
 

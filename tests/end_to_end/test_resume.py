@@ -15,7 +15,7 @@ import torch
 
 from raytran.checkpoints.runs import FINISHED, LAST, PREVIOUS, one_at_a_time
 from raytran.errors import CheckpointError, ConfigError
-from raytran.training.reconstruction import Reconstruction
+from raytran.training.lightning_module import Reconstruction
 
 from .runs import assert_same, fit, table
 

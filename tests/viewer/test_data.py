@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from raytran.backbone.observed import observe_attention
 from raytran.errors import DataError
 from raytran.geometry.grid import VoxelGrid
 from raytran.structs import Views
+from raytran.viewer.attention_record import observe_attention
 from raytran.viewer.data import (
     VoxelVolume,
     find_scenes,

@@ -18,7 +18,7 @@ from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.position import position_code, ray_code
 from raytran.ops.pairs import Pairs
 from raytran.ops.splat import splat_in_chunks
-from raytran.ops.tracer import RayTracer
+from raytran.ops.traverse import RayTracer
 
 
 class VoxelBackbone(nn.Module, ABC):

@@ -15,7 +15,7 @@ from raytran.checkpoints.file import PREFIX, checkpoint_path, read_checkpoint
 from raytran.checkpoints.network import build_network
 from raytran.errors import CheckpointError
 from raytran.model import RayTran
-from raytran.ops.tracer import Attention, RayTracer
+from raytran.ops.traverse import Attention, RayTracer
 
 
 def load_model(

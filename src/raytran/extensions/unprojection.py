@@ -19,7 +19,7 @@ from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.ops.pairs import PairList, Pairs
 from raytran.ops.splat import splat_in_chunks
-from raytran.ops.tracer import RayTracer
+from raytran.ops.traverse import RayTracer
 
 
 class UnprojectionBackbone(VoxelBackbone):

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.position import ray_code
-from raytran.heads.dense import image_upsampler
+from raytran.heads.auxiliary import image_upsampler
 from raytran.ops.pairs import Pairs
 
 

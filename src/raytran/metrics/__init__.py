@@ -4,8 +4,8 @@
 from raytran.metrics.accuracy_curves import AccuracyCurves
 from raytran.metrics.box_f1 import OrientedBoxF1
 from raytran.metrics.error_atlas import ErrorAtlas
-from raytran.metrics.iou import ForegroundIoU, SceneOccupancyIoU
 from raytran.metrics.new_views import PSNR, SSIM, NewViewScores
+from raytran.metrics.occupancy_iou import ForegroundIoU, SceneOccupancyIoU
 from raytran.metrics.scan2cad import Scan2CADAccuracy
 from raytran.metrics.shape import MatchedShapeScores
 

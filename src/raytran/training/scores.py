@@ -10,8 +10,8 @@ import torch
 from torch import nn
 
 from raytran.metrics.box_f1 import OrientedBoxF1
-from raytran.metrics.iou import ForegroundIoU, SceneOccupancyIoU
 from raytran.metrics.new_views import NewViewScores
+from raytran.metrics.occupancy_iou import ForegroundIoU, SceneOccupancyIoU
 from raytran.metrics.per_scene import Row
 from raytran.metrics.shape import MatchedShapeScores
 from raytran.metrics.strict import StrictScores, side_by_side

@@ -35,8 +35,8 @@ from raytran.viewer.truth import ObjectError, object_errors
 
 if TYPE_CHECKING:
     # Not to read a result: the network alone takes seconds to import.
-    from raytran.backbone.observed import ObservedAttention
     from raytran.model import RayTran
+    from raytran.viewer.attention_record import ObservedAttention
 
 FILE = "viewer.npz"
 FORMAT = "raytran.viewer/1"

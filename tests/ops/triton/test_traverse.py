@@ -10,8 +10,7 @@ from raytran.errors import ConfigError, ShapeError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.ops.pairs import PairList
-from raytran.ops.tracer import RayTracer
-from raytran.ops.traverse import trace_pairs
+from raytran.ops.traverse import RayTracer, trace_pairs
 from raytran.ops.triton.block_pairs import BlockPairs
 
 pytest.importorskip("triton", reason="Triton is not installed: the kernels have nothing to run on")

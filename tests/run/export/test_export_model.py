@@ -14,7 +14,7 @@ import raytran
 from raytran.checkpoints.file import read_checkpoint, write_checkpoint, write_weights
 from raytran.checkpoints.load import prediction_settings
 from raytran.errors import CheckpointError, ConfigError
-from raytran.export.program import example_inputs
+from raytran.export.torch_program import example_inputs
 from raytran.run.entry import compose
 from raytran.run.export.export_model import export_model
 from raytran.run.plan.camera_paths import walk

@@ -14,7 +14,7 @@ from torch import nn
 from raytran.capture.lens import Lens
 from raytran.capture.render_cameras import RenderCameras
 from raytran.errors import ConfigError, DataError
-from raytran.geometry.volumes import Volumes
+from raytran.geometry.room_tiles import Volumes
 from raytran.run.predict.new_views import cameras_to_render, render_views
 from raytran.run.predict.room import RoomViews
 from raytran.structs import Views

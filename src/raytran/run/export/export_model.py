@@ -17,8 +17,8 @@ from raytran.checkpoints.file import PREFIX, SUFFIX, checkpoint_path, export_wei
 from raytran.checkpoints.load import model_from, prediction_settings
 from raytran.checkpoints.network import trusted_packages
 from raytran.errors import ConfigError
-from raytran.export.program import SUFFIX as PROGRAM_SUFFIX
-from raytran.export.program import export_program
+from raytran.export.torch_program import SUFFIX as PROGRAM_SUFFIX
+from raytran.export.torch_program import export_program
 from raytran.run.plan.camera_paths import walk
 from raytran.run.train.build import plain
 from raytran.structs import CLASSES

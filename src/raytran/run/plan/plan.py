@@ -21,7 +21,7 @@ from raytran.errors import ConfigError
 from raytran.geometry.grid import VoxelGrid
 from raytran.model import RayTran
 from raytran.ops.pairs import listed
-from raytran.ops.tracer import RayTracer
+from raytran.ops.traverse import RayTracer
 from raytran.run.plan.camera_paths import recorded, walk
 from raytran.run.plan.dry_run import PRECISIONS, Load, dry_prediction, dry_training
 from raytran.run.plan.roofline import Ceilings, measure_ceilings

@@ -14,7 +14,7 @@ from raytran.capture.render_cameras import RenderCameras, read_render_cameras
 from raytran.data.files import finished_folder
 from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
-from raytran.geometry.volumes import places_ahead
+from raytran.geometry.room_tiles import places_ahead
 from raytran.model import RayTran
 from raytran.run.predict.room import RoomViews
 

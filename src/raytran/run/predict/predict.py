@@ -11,7 +11,6 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from raytran.backbone.observed import observe_attention
 from raytran.capture.open import open_scene
 from raytran.capture.orientation import WorldSettings
 from raytran.checkpoints.load import PredictionSettings, load_model, prediction_settings
@@ -27,6 +26,7 @@ from raytran.run.predict.room import RoomViews, check_choice, read_room
 from raytran.run.predict.write_scene import MARKER, PredictedScene, check_pictures, write_scene
 from raytran.structs import ScenePrediction
 from raytran.viewer import has_viser
+from raytran.viewer.attention_record import observe_attention
 from raytran.viewer.data import predicted_volumes
 from raytran.viewer.truth import read_truth
 

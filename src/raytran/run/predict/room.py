@@ -17,7 +17,7 @@ from raytran.data.views import choose_by_coverage, choose_even
 from raytran.errors import ConfigError, DataError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
-from raytran.geometry.volumes import Volumes, cover
+from raytran.geometry.room_tiles import Volumes, cover
 from raytran.model import RayTran
 from raytran.structs import Views
 

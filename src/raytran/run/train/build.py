@@ -26,9 +26,9 @@ from raytran.training.callbacks.step_progress import StepProgress
 from raytran.training.callbacks.telemetry import RunSettings, Telemetry
 from raytran.training.checkpoint_io import AtomicCheckpointIO
 from raytran.training.datamodule import SceneDataModule
+from raytran.training.lightning_module import Reconstruction
 from raytran.training.loggers import METRICS, MetricsTable
 from raytran.training.ranks import SyncedBatchNorm
-from raytran.training.reconstruction import Reconstruction
 
 if TYPE_CHECKING:
     from raytran.model import RayTran

@@ -30,7 +30,7 @@ from raytran.run.train.settings import RunConfig
 from raytran.run.train.start_report import changed_settings, start_report
 from raytran.training.callbacks.stage import StageCallback
 from raytran.training.callbacks.stop_signals import StopRequestedError
-from raytran.training.reconstruction import Reconstruction
+from raytran.training.lightning_module import Reconstruction
 from raytran.training.stage import Stage
 
 if TYPE_CHECKING:

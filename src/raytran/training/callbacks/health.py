@@ -16,9 +16,9 @@ from torch.optim import Optimizer
 from raytran.errors import NonFiniteError
 from raytran.structs import RawObjects, SceneBatch
 from raytran.training.health_signals import RunningStatistics, gradient_norms, slot_signals
+from raytran.training.lightning_module import Reconstruction
 from raytran.training.loggers import was_logged_step
 from raytran.training.ranks import mean_over_ranks
-from raytran.training.reconstruction import Reconstruction
 
 _log = logging.getLogger(__name__)
 

@@ -22,7 +22,7 @@ from raytran.model import inputs_of
 from raytran.pictures.scene_pictures import draw_scene
 from raytran.postprocess import DUPLICATE_IOU, SCORE_THRESHOLD, select_objects
 from raytran.structs import SceneBatch, ScenePrediction
-from raytran.training.reconstruction import Reconstruction
+from raytran.training.lightning_module import Reconstruction
 
 _log = logging.getLogger(__name__)
 

@@ -15,7 +15,7 @@ from torch import nn
 from raytran.checkpoints.card import DataIdentity
 from raytran.checkpoints.load import fresh_parts, load_weights
 from raytran.errors import CheckpointError
-from raytran.training.reconstruction import Reconstruction
+from raytran.training.lightning_module import Reconstruction
 from raytran.training.stage import Stage
 
 _log = logging.getLogger(__name__)

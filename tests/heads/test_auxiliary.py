@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import torch
 
-from raytran.heads.dense import ForegroundHead, OccupancyHead
+from raytran.heads.auxiliary import ForegroundHead, OccupancyHead
 
 
 def test_one_convolution_over_the_voxels() -> None:

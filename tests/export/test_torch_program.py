@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from raytran.errors import ConfigError
-from raytran.export.program import example_inputs, export_network, export_shapes
+from raytran.export.torch_program import example_inputs, export_network, export_shapes
 from raytran.geometry.camera import Cameras
 from raytran.model import TASKS, RayTran
 from raytran.run.entry import compose

@@ -6,12 +6,12 @@ import torch
 from torch import nn
 
 from raytran.backbone.backbone import Backbone
-from raytran.backbone.observed import observe_attention
 from raytran.backbone.resnet import ResNet18
 from raytran.errors import ShapeError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.ops.traverse import trace_pairs
+from raytran.viewer.attention_record import observe_attention
 
 from ..factories import run_backbone
 

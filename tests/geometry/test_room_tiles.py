@@ -10,7 +10,7 @@ import torch
 
 from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
-from raytran.geometry.volumes import AHEAD, BESIDE, OVERLAP, Volumes, cover, places_ahead
+from raytran.geometry.room_tiles import AHEAD, BESIDE, OVERLAP, Volumes, cover, places_ahead
 
 RESOLUTION, EXTENT = (48, 48, 16), (9.0, 9.0, 3.5)
 VOXEL = torch.tensor([9 / 48, 9 / 48, 3.5 / 16], dtype=torch.float64)
