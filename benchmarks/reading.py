@@ -4,8 +4,8 @@
     python benchmarks/reading.py
 
 A profiler hook follows every call into ``src/raytran`` during one training step (forward, loss, backward) and
-one prediction of a small network on the CPU, and counts the files entered, the changes from one file to
-another, and the depth of the calls. It says nothing of time: it is a measure of the code.
+one prediction of a small network on the CPU, and counts the files entered, the calls from one file into
+another, and their depth. It says nothing of time: it is a measure of the code.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Walk:
     Attributes:
         files: entered, in the order of the first visit.
         functions: entered.
-        changes: how often a call or a return led from one file to another.
+        changes: calls that led from one file into another.
         depth: the most calls of the package that were open at once.
     """
 
@@ -69,16 +69,15 @@ def walk(run: Callable[[], Any]) -> Walk:
         if frame.f_code.co_name.startswith("<"):  # comprehensions and lambdas are read where they stand
             return
         file = str(Path(path).relative_to(PACKAGE))
-        before = open_files[-1] if open_files else None
-        if event == "call":
-            open_files.append(file)
-            found.files.setdefault(file)
-            found.functions.add((file, frame.f_code.co_qualname))
-            found.depth = max(found.depth, len(open_files))
-        elif open_files:
-            open_files.pop()
-        now = open_files[-1] if open_files else None
-        found.changes += before is not None and now is not None and before != now
+        if event == "return":
+            if open_files:
+                open_files.pop()
+            return
+        found.changes += bool(open_files) and open_files[-1] != file
+        open_files.append(file)
+        found.files.setdefault(file)
+        found.functions.add((file, frame.f_code.co_qualname))
+        found.depth = max(found.depth, len(open_files))
 
     sys.setprofile(follow)
     try:
@@ -146,7 +145,7 @@ def main() -> None:
     for name, found in (("training step", training_step()), ("predict", prediction())):
         print(
             f"{name}: {len(found.files)} files, {len(found.functions)} functions, "
-            f"{found.changes} changes of file, depth {found.depth}"
+            f"{found.changes} calls into another file, depth {found.depth}"
         )
         print("  " + " ".join(found.files))
 

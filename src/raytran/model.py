@@ -144,10 +144,11 @@ class RayTran(nn.Module):
     def trace(self, cameras: Cameras, grid: VoxelGrid) -> Pairs:
         """Return the pairs that the backbone reads, for cameras of leading shape ``(B, N)``."""
         height, width = cameras.image_size
+        stride = self.backbone.stride
         return self.backbone.trace(
             cameras,
             grid,
-            (height // self.backbone.stride, width // self.backbone.stride),
+            (height // stride, width // stride),
             ray_tracer=self.ray_tracer,
             rays_per_cell=self.rays_per_cell,
         )

@@ -69,8 +69,7 @@ class UnprojectionBackbone(VoxelBackbone):
         """Return the pairs of ``pair_centers``; no ray is traced."""
         pairs = pair_centers(cameras, grid, feature_size)
         # Both orders are made here, outside of code that is compiled for one size.
-        pairs.by("pixels")
-        pairs.by("voxels")
+        pairs.orders()
         return pairs
 
     def forward(

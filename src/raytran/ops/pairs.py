@@ -105,6 +105,10 @@ class PairList(TensorStruct):
             self._orders[rows] = self._order_by_pixels() if rows == "pixels" else self._order_by_voxels()
         return self._orders[rows]
 
+    def orders(self, rows: Side = "pixels") -> tuple[PairOrder, PairOrder]:
+        """Return both orders, that of ``rows`` first."""
+        return self.by(rows), self.by("voxels" if rows == "pixels" else "pixels")
+
     def pixels_per_voxel(self) -> Tensor:
         """Return with how many pixels each voxel is paired, ``(num_voxels,)`` int32."""
         return self.by("voxels").row_offsets.diff()
@@ -146,8 +150,8 @@ def why_no_kernels(device: torch.device) -> str | None:
     return None if find_spec("triton") is not None else "Triton is not installed"
 
 
-def fused_blocks(pairs: Pairs, device: torch.device, dtype: torch.dtype, channels: int) -> BlockPairs | None:
-    """Return the block pairs for the fused kernels; None, and say once why, where they do not run.
+def pairs_for(pairs: Pairs, device: torch.device, dtype: torch.dtype, channels: int) -> Pairs:
+    """Return the pairs in blocks for the fused kernels; where these do not run, say once why, as a list.
 
     Args:
         pairs: the pairs; block pairs on a CPU ask for Triton's interpreter, if that is switched on.
@@ -164,7 +168,7 @@ def fused_blocks(pairs: Pairs, device: torch.device, dtype: torch.dtype, channel
         return pairs.blocks() if isinstance(pairs, PairList) else pairs
     if not torch.compiler.is_compiling():
         _log_once(logging.WARNING if device.type == "cuda" else logging.DEBUG, reason)
-    return None
+    return listed(pairs)
 
 
 def listed(pairs: Pairs) -> PairList:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from raytran.errors import check_shape
-from raytran.ops.pairs import Pairs, fused_blocks, listed
+from raytran.ops.pairs import PairList, Pairs, pairs_for
 from raytran.ops.sparse import pair_attention
 
 Direction = Literal["pixels_to_voxels", "voxels_to_pixels"]
@@ -127,17 +127,15 @@ def _attend(
         if tensor.shape != (sources, *query.shape[1:]):
             check_shape(tensor, f"{sources} {query.shape[1]} {query.shape[2]}", name)
     dtype = torch.promote_types(torch.promote_types(query.dtype, key.dtype), value.dtype)
-    blocks = fused_blocks(pairs, query.device, dtype, query.shape[2])
-    if blocks is not None:
+    pairs = pairs_for(pairs, query.device, dtype, query.shape[2])
+    if not isinstance(pairs, PairList):
         # CPU installations of torch lack Triton: its module is imported only where it runs.
         from raytran.ops.triton.attention import block_attention
 
         qkv = query.to(dtype), key.to(dtype), value.to(dtype)
-        out, logsumexp = block_attention(*qkv, blocks, to_voxels=to_voxels)
+        out, logsumexp = block_attention(*qkv, pairs, to_voxels=to_voxels)
         return out.to(query.dtype), logsumexp, True
     dtype = torch.promote_types(dtype, torch.float32)
-    pairs = listed(pairs)
-    by_target = pairs.by("voxels" if to_voxels else "pixels")
-    by_source = pairs.by("pixels" if to_voxels else "voxels")
+    by_target, by_source = pairs.orders("voxels" if to_voxels else "pixels")
     out, logsumexp = pair_attention(query.to(dtype), key.to(dtype), value.to(dtype), by_target, by_source)
     return out.to(query.dtype), logsumexp, False

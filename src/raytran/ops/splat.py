@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from raytran.errors import check_shape
-from raytran.ops.pairs import PairOrder, Pairs, fused_blocks, listed
+from raytran.ops.pairs import PairList, PairOrder, Pairs, pairs_for
 from raytran.ops.sparse import sparse_product
 
 
@@ -33,17 +33,16 @@ def splat_features(features: Tensor, pairs: Pairs) -> tuple[Tensor, Tensor]:
     if features.ndim != 2 or features.shape[0] != pairs.num_pixels:
         check_shape(features, f"{pairs.num_pixels} C", "features")
     # The kernel takes as many channels together as it can: any number fits.
-    blocks = fused_blocks(pairs, features.device, features.dtype, channels=1)
-    if blocks is not None:
+    pairs = pairs_for(pairs, features.device, features.dtype, channels=1)
+    if not isinstance(pairs, PairList):
         # CPU installations of torch lack Triton: its module is imported only where it runs.
         from raytran.ops.triton.sum import block_sum
 
-        count = blocks.pixels_per_voxel()
-        mean = block_sum(features, blocks) / count.clamp(min=1)[:, None]
+        count = pairs.pixels_per_voxel()
+        mean = block_sum(features, pairs) / count.clamp(min=1)[:, None]
         return mean.to(features.dtype), count > 0
     dtype = torch.promote_types(features.dtype, torch.float32)
-    pairs = listed(pairs)
-    by_voxel, by_pixel = pairs.by("voxels"), pairs.by("pixels")
+    by_voxel, by_pixel = pairs.orders("voxels")
     with torch.autocast(features.device.type, enabled=False):
         mean = _mean(features.to(dtype), list(by_voxel), list(by_pixel))
     return mean.to(features.dtype), by_voxel.row_offsets.diff() > 0

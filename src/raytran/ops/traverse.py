@@ -80,22 +80,23 @@ def trace_pairs(
     num_pixels = rays.first.shape[0] // rays_per_pixel
     at_once = _AT_ONCE.get(rays.first.device.type, _AT_ONCE_ELSEWHERE) // max(grid.resolution)
     pixels_at_once = max(1, at_once // rays_per_pixel)
+    num_voxels = grid.num_voxels
     keys = []
     for pixel in range(0, num_pixels, pixels_at_once):
         chunk = slice(pixel * rays_per_pixel, (pixel + pixels_at_once) * rays_per_pixel)
         key = _trace(_Rays(*(part[..., chunk] for part in rays)), grid.resolution, rays_per_pixel)
-        keys.append(key.long() + pixel * grid.num_voxels)
+        keys.append(key.long() + pixel * num_voxels)
     key = torch.cat(keys)
-    pixel_index = key.div(grid.num_voxels, rounding_mode="floor")
-    voxel_index = key - pixel_index * grid.num_voxels
+    pixel_index = key.div(num_voxels, rounding_mode="floor")
+    voxel_index = key - pixel_index * num_voxels
     if scenes > 1:
-        voxel_index += pixel_index.div(num_pixels // scenes, rounding_mode="floor") * grid.num_voxels
+        voxel_index += pixel_index.div(num_pixels // scenes, rounding_mode="floor") * num_voxels
     views = num_pixels // (feature_size[0] * feature_size[1])
     return PairList(
         pixel_index,
         voxel_index,
         num_pixels,
-        scenes * grid.num_voxels,
+        scenes * num_voxels,
         pixel_shape=(views, *feature_size),
         voxel_shape=(scenes, *grid.resolution),
     )
@@ -261,7 +262,7 @@ class RayTracer:
             pairs = trace_pairs(cameras, grid, feature_size, rays_per_cell)
             pairs = pairs if self.attention == "auto" else replace(pairs, fused=False)
         # Their sizes depend on the data: better here than in code compiled for one size.
-        pairs.by("pixels"), pairs.by("voxels")
+        pairs.orders()
         return pairs
 
     def _is_fused(self, device: torch.device) -> bool:

@@ -223,10 +223,10 @@ def test_tuples_of_the_kernels_hold_tensors_alone(random_pairs, generator):
     ("dtype", "channels"), [(torch.float32, 128), (torch.bfloat16, 256), (torch.float64, 8)]
 )
 def test_heads_that_do_not_fit_a_gpu_are_left_to_torch_sparse(random_pairs, generator, dtype, channels):
-    from raytran.ops.pairs import fused_blocks
+    from raytran.ops.pairs import PairList, pairs_for
 
     pairs = random_pairs(9, 14, 0.4)
-    assert fused_blocks(pairs.blocks(), torch.device(DEVICE), dtype, channels) is None
+    assert isinstance(pairs_for(pairs.blocks(), torch.device(DEVICE), dtype, channels), PairList)
     inputs = _inputs(pairs, "pixels_to_voxels", 1, channels, generator, dtype)
     assert torch.equal(
         ray_attention(*inputs, pairs.blocks().to(DEVICE)), ray_attention(*inputs, pairs.to(DEVICE))
@@ -234,9 +234,10 @@ def test_heads_that_do_not_fit_a_gpu_are_left_to_torch_sparse(random_pairs, gene
 
 
 def test_pairs_that_ask_for_torch_sparse_get_it(random_pairs):
-    from raytran.ops.pairs import fused_blocks
+    from raytran.ops.pairs import PairList, pairs_for
 
     pairs = random_pairs(9, 14, 0.4)
     for device in ("cpu", "cuda"):
-        assert fused_blocks(replace(pairs, fused=False), torch.device(device), torch.float32, 8) is None
-    assert fused_blocks(pairs, torch.device("cuda"), torch.float32, 8) is not None
+        without = replace(pairs, fused=False)
+        assert isinstance(pairs_for(without, torch.device(device), torch.float32, 8), PairList)
+    assert not isinstance(pairs_for(pairs, torch.device("cuda"), torch.float32, 8), PairList)

@@ -129,6 +129,10 @@ class BlockPairs(TensorStruct):
             return cached(self, "_by_pixels", self._order_by_pixels)
         return cached(self, "_by_voxels", self._order_by_voxels)
 
+    def orders(self) -> tuple[BlockOrder, BlockOrder]:
+        """Return both orders, that of pixel tiles first."""
+        return self.by("pixels"), self.by("voxels")
+
     def _order_by_pixels(self) -> BlockOrder:
         return self._order(0, self._tile, self._block, self.pixels, self.voxels)
 
