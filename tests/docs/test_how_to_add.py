@@ -58,12 +58,13 @@ def table(project_root):
 
 @pytest.fixture(scope="module")
 def rooms(tmp_path_factory):
-    """Four rooms, with a bed in that of validation."""
+    """Three rooms, with a bed in that of validation."""
     folder = tmp_path_factory.mktemp("rooms")
     generate_rooms(
         folder,
         num_train=2,
         num_val=1,
+        seed=4,
         frames=6,
         image_size=(64, 64),
         min_objects=3,
@@ -248,8 +249,11 @@ def test_a_class_list(copy, sections, rooms):
         assert text.count(before) == 1
         text = text.replace(before, after)
     path.write_text(text)
+    few = ["rooms.num_train=1", "rooms.num_val=1", "rooms.frames=6", "rooms.image_size=[64,64]"]
     run_in(
-        copy, ["experiment=stage2", "init_from=none", "data=scan2cad", f"data.root={rooms}", "output_dir=of-ten"]
+        copy,
+        ["experiment=stage2", "init_from=none", "data=scan2cad", f"data.root={rooms}", "output_dir=of-ten"],
+        ["experiment=stage1", *few, "output_dir=made"],
     )
     assert "val/objects/accuracy/bed" in logged(copy / "of-ten")
     state = torch.load(copy / "of-ten" / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
