@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 
@@ -26,11 +27,9 @@ COLUMNS: tuple[dict[str, str], ...] = (
     {"checkpoints": "weights and what\nthey are"},
     {"export": "GLB, OBJ, CSV,\nprograms", "training": "Lightning:\nstages, callbacks"},
     {"run": "configs →\nobjects"},
-    {
-        name: ""
-        for name in ("train", "curriculum", "evaluate", "predict", "prepare", "plan", "demo", "view")
-        + ("export_model",)
-    },
+    dict.fromkeys(
+        ("train", "curriculum", "evaluate", "predict", "prepare", "plan", "demo", "view", "export_model"), ""
+    ),
 )
 """Folders and files from left to right, each with what it holds; the last column are the commands."""
 
@@ -75,23 +74,32 @@ def draw() -> Figure:
     for number, (name, what) in enumerate(WINGS.items()):
         left = run_place - (2 - number) * _STEP
         _box(axes, left, bottom, name, what, _WING)
-        _arrow(axes, (run_place + _WIDTH / 2, middle - _HEIGHT / 2), (left + _WIDTH / 2, bottom + _HEIGHT / 2))
-    axes.text(0, -0.75, "an arrow points to what may be imported: what stands further left; run also imports the wings", fontsize=9)
+        _arrow(
+            axes, (run_place + _WIDTH / 2, middle - _HEIGHT / 2), (left + _WIDTH / 2, bottom + _HEIGHT / 2)
+        )
+    axes.text(
+        0,
+        -0.75,
+        "an arrow points to what may be imported: what stands further left; run also imports the wings",
+        fontsize=9,
+    )
     axes.text(0, -1.1, "blue: the method    yellow: wings, which run alone imports", fontsize=9)
     return figure
 
 
-def _box(axes, left: float, middle: float, name: str, what: str, color: str) -> None:
+def _box(axes: Axes, left: float, middle: float, name: str, what: str, color: str) -> None:
     height = _HEIGHT if what else _HEIGHT * 0.5
     corner = (left, middle - height / 2)
     style = "round,pad=0,rounding_size=0.06"
-    axes.add_patch(FancyBboxPatch(corner, _WIDTH, height, boxstyle=style, facecolor=color, edgecolor="#888888"))
+    axes.add_patch(
+        FancyBboxPatch(corner, _WIDTH, height, boxstyle=style, facecolor=color, edgecolor="#888888")
+    )
     lift = 0.15 if "\n" in what else 0.1 if what else 0
     axes.text(left + _WIDTH / 2, middle + lift, name, ha="center", va="center", fontsize=9, weight="bold")
     axes.text(left + _WIDTH / 2, middle - 0.12, what, ha="center", va="center", fontsize=6.5, linespacing=1.0)
 
 
-def _arrow(axes, start: tuple[float, float], end: tuple[float, float]) -> None:
+def _arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float]) -> None:
     axes.add_patch(FancyArrowPatch(start, end, arrowstyle="-|>", mutation_scale=8, color="#888888", zorder=0))
 
 

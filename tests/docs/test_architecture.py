@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""docs/architecture.md: its picture has the folders of the layers, its lines name functions that are there."""
+"""docs/architecture.md: its picture has the folders of the layers, its lines name what is there."""
 
 from __future__ import annotations
 

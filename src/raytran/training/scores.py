@@ -57,7 +57,7 @@ class SceneScores(nn.Module):
         self.occupancy = SceneOccupancyIoU() if "occupancy" in tasks else None
         self.foreground = ForegroundIoU() if "foreground" in tasks else None
         self.new_views = NewViewScores() if "view" in tasks else None
-        self.metrics = nn.ModuleDict(metrics or {})
+        self.metrics: Any = nn.ModuleDict(metrics or {})
 
     def update(self, batch: SceneBatch, predictions: Sequence[ScenePrediction]) -> None:
         """Add scenes; a metric whose targets the batch lacks is left as it is."""
