@@ -90,7 +90,7 @@ def _walk(node: yaml.MappingNode, prefix: str, text: str, lines: list[str]) -> I
             continue
         line, name = key.start_mark.line, f"{prefix}{key.value}"
         comment = _comment(lines, line)
-        if isinstance(value, yaml.MappingNode):
+        if isinstance(value, yaml.MappingNode) and value.value:
             if comment and not value.flow_style:
                 yield Option(name, None, comment, line)
             yield from _walk(value, f"{name}.", text, lines)

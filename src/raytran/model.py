@@ -126,6 +126,7 @@ class RayTran(nn.Module):
             proposals=objects.proposals,
             denoising=objects.denoising,
             new_views=self._render(voxels, grid, new_cameras) if "view" in tasks else None,
+            voxels=voxels,
         )
 
     def _run_backbone(

@@ -334,6 +334,7 @@ class RawScene(TensorStruct):
         proposals: where the queries of ``objects`` come from; None if they are learned.
         new_views: ``(B, V, 3, H, W)`` logits of red, green and blue.
         denoising: as ``objects``, for noisy copies of the true ones; query i is a copy of object i modulo M.
+        voxels: ``(B, X, Y, Z, C)`` features that the heads read, for heads of your own.
     """
 
     grid_center: Tensor
@@ -343,6 +344,7 @@ class RawScene(TensorStruct):
     proposals: RawProposals | None = None
     new_views: Tensor | None = None
     denoising: tuple[RawObjects, ...] | None = None
+    voxels: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torchmetrics import SumMetric
 
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.structs import ObjectSet, SceneBatch, ScenePrediction, Views
@@ -79,3 +80,17 @@ def test_only_metrics_of_the_tasks() -> None:
     }
     scores.reset()
     assert scores.results()["strict"]["n_total"] == 0
+
+
+class Found(SumMetric):
+    def update(self, batch, predictions) -> None:
+        super().update(sum(len(prediction.objects) for prediction in predictions))
+
+
+def test_metrics_of_ones_own() -> None:
+    truth = objects([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]], [1.0, 0.1])
+    scores = SceneScores(tasks=[], metrics={"found": Found()})
+    scores.update(batch(truth), [ScenePrediction("a", truth, torch.zeros(3))])
+    assert scores.results() == scores.compute() == {"found": 2.0}
+    scores.reset()
+    assert scores.compute() == {"found": 0.0}

@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import lightning.pytorch as pl
 import torch
 from torch import Tensor
-from torchmetrics import MeanMetric
+from torchmetrics import MeanMetric, Metric
 
 from raytran.losses.total import TotalLoss
 from raytran.model import RayTran, inputs_of
@@ -29,6 +30,7 @@ class Reconstruction(pl.LightningModule):
         optimization: optimiser and schedule.
         compiled: run the model through ``torch.compile``. What is compiled is the function, not the module,
             so that weights keep their names.
+        metrics: validation scores besides ours, by name, see ``SceneScores``.
     """
 
     def __init__(
@@ -39,13 +41,14 @@ class Reconstruction(pl.LightningModule):
         stage: Stage,
         optimization: Optimization,
         compiled: bool = False,
+        metrics: Mapping[str, Metric] | None = None,
     ) -> None:
         super().__init__()
         self.model = model
         self.loss = loss
         self.stage = stage
         self.optimization = optimization
-        self.scores = SceneScores(tasks=stage.tasks)
+        self.scores = SceneScores(tasks=stage.tasks, metrics=metrics)
         self._compiled = torch.compile(model.forward) if compiled else None
         self._val_losses: dict[str, MeanMetric] = {}
 

@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Literal
 
 import torch
 from torch import nn
+from torchmetrics import Metric
 
 from raytran.metrics.box_f1 import OrientedBoxF1
 from raytran.metrics.new_views import NewViewScores
@@ -31,6 +32,8 @@ class SceneScores(nn.Module):
         duplicate_iou: nor does one that overlaps a surer one of its class by more than this IoU.
         volume_extent: size of the voxel grid, metres; given, the results also tell why objects are missed
             (``ErrorAtlas``) and how many would be found at other thresholds (``AccuracyCurves``).
+        metrics: further ones by name, e.g. of your own: ``update(batch, predictions)`` gets what ``update``
+            here gets, objects of every score among it, and ``compute()`` returns one number. None for none.
     """
 
     def __init__(
@@ -40,6 +43,7 @@ class SceneScores(nn.Module):
         score_threshold: float = SCORE_THRESHOLD,
         duplicate_iou: float | None = DUPLICATE_IOU,
         volume_extent: Sequence[float] | None = None,
+        metrics: Mapping[str, Metric] | None = None,
     ) -> None:
         super().__init__()
         self._score_threshold = score_threshold
@@ -53,6 +57,7 @@ class SceneScores(nn.Module):
         self.occupancy = SceneOccupancyIoU() if "occupancy" in tasks else None
         self.foreground = ForegroundIoU() if "foreground" in tasks else None
         self.new_views = NewViewScores() if "view" in tasks else None
+        self.metrics: Any = nn.ModuleDict(metrics or {})
 
     def update(self, batch: SceneBatch, predictions: Sequence[ScenePrediction]) -> None:
         """Add scenes; a metric whose targets the batch lacks is left as it is."""
@@ -70,6 +75,8 @@ class SceneScores(nn.Module):
         rendered = [p.new_views for p in predictions if p.new_views is not None]
         if self.new_views is not None and batch.new_views is not None and len(rendered) == len(predictions):
             self.new_views.update(torch.stack(rendered), batch.new_views, batch.views, batch.scene_id)
+        for metric in self.metrics.values():
+            metric.update(batch, predictions)
 
     def update_shapes(self, batch: SceneBatch, predictions: Sequence[ScenePrediction]) -> None:
         """Add the shapes of scenes; apart from ``update``, since decoding them for every query is dear.
@@ -105,7 +112,7 @@ class SceneScores(nn.Module):
             results["shape"] = self.shape.compute()
         if self.new_views is not None:
             results["new_views"] = self.new_views.compute()
-        return results
+        return results | {name: float(metric.compute()) for name, metric in self.metrics.items()}
 
     def compute(self) -> dict[str, float]:
         """Return the numbers to watch during training: ``task/number``, ``task/number/class``.
@@ -132,7 +139,7 @@ class SceneScores(nn.Module):
         for name, value in results.get("new_views", {}).items():
             if name != "n_views":
                 numbers[f"view/{name}"] = value
-        return numbers
+        return numbers | {name: results[name] for name in self.metrics}
 
     def rows(self, per: Literal["scene", "object"]) -> list[Row]:
         """Return a row for each scene or true object, the columns of the object metrics side by side."""
@@ -147,6 +154,6 @@ class SceneScores(nn.Module):
     def reset(self) -> None:
         """Forget all scenes."""
         objects = (self.strict, self.box_f1_of_all, self.shape)
-        for metric in (*objects, self.occupancy, self.foreground, self.new_views):
+        for metric in (*objects, self.occupancy, self.foreground, self.new_views, *self.metrics.values()):
             if metric is not None:
                 metric.reset()

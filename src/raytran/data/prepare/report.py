@@ -211,7 +211,7 @@ def class_table(objects: Mapping[str, Mapping[str, int]]) -> Iterable[str]:
     columns = dict(objects) | ({"val, paper": PAPER_VAL_OBJECTS} if "val" in objects else {})
     yield "Objects  " + " " * 11 + "".join(f"{name:>12}" for name in columns)
     for name in CLASSES:
-        yield f"         {name:<11}" + "".join(f"{column[name]:>12}" for column in columns.values())
+        yield f"         {name:<11}" + "".join(f"{column.get(name, '–'):>12}" for column in columns.values())
     yield f"         {'all':<11}" + "".join(f"{sum(column.values()):>12}" for column in columns.values())
 
 

@@ -11,10 +11,12 @@ from typing import Any, cast
 
 import torch
 from hydra.core.hydra_config import HydraConfig
+from hydra.utils import instantiate
 from omegaconf import DictConfig
 from rich.console import Console
 from rich.progress import track
 from torch.utils.data import Dataset, Subset
+from torchmetrics import Metric
 
 from raytran.checkpoints.load import PredictionSettings, load_model, prediction_settings
 from raytran.checkpoints.network import trusted_packages
@@ -109,6 +111,7 @@ def _of_checkpoint(cfg: DictConfig) -> tuple[Evaluation, str]:
         views_at_once=cfg.views_at_once,
         num_resamples=cfg.num_resamples,
         seed=cfg.seed,
+        metrics=instantiate(cfg.metrics, _convert_="all"),
         about=about_data(data, split, cfg.views.num_views)
         | {"checkpoint": str(cfg.checkpoint), "max_objects": cfg.max_objects},
     )
@@ -175,6 +178,7 @@ def evaluate_model(
     views_at_once: int | None = None,
     num_resamples: int = 2000,
     seed: int = 0,
+    metrics: Mapping[str, Metric] | None = None,
     about: Mapping[str, Any] | None = None,
     progress: bool = True,
 ) -> Evaluation:
@@ -190,6 +194,7 @@ def evaluate_model(
         views_at_once: frames that pass through the network together, None for all.
         num_resamples: draws of the bootstrap.
         seed: of the bootstrap.
+        metrics: further ones by name, see ``SceneScores``.
         about: what to say beside the numbers, e.g. the checkpoint.
         progress: show a progress bar.
 
@@ -197,7 +202,7 @@ def evaluate_model(
         per protocol (``strict``) what ``Scan2CADAccuracy`` and ``OrientedBoxF1`` return, with ``confidence``
         intervals, the accuracy ``by_scene_size``, the ``curves`` and the error ``atlas``; ``occupancy_iou``,
         ``foreground_iou``, under ``shape`` what ``MatchedShapeScores`` returns, under ``new_views`` what
-        ``NewViewScores`` does, and what ``about`` says.
+        ``NewViewScores`` does, each of ``metrics`` by its name, and what ``about`` says.
     """
     device = next(model.parameters()).device
     scores = SceneScores(
@@ -205,6 +210,7 @@ def evaluate_model(
         score_threshold=score_threshold,
         duplicate_iou=duplicate_iou,
         volume_extent=model.grid_extent,
+        metrics=metrics,
     ).to(device)
     model.eval()
     forward_tasks = [task for task in tasks if task != "shape"]  # shapes are decoded of chosen objects alone

@@ -61,6 +61,7 @@ def build_module(cfg: DictConfig, model: RayTran) -> Reconstruction:
         stage=instantiate(cfg.stage, _convert_="all"),
         optimization=instantiate(cfg.optimizer, _convert_="all"),
         compiled=cfg.compile,
+        metrics=instantiate(cfg.get("metrics", {}), _convert_="all"),
     )
 
 

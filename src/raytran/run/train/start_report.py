@@ -13,7 +13,7 @@ from raytran.training.stage import Stage
 
 _NOT_COMPUTED = {
     *("output_dir", "outputs", "resume", "init_from", "check_parent", "progress_bar", "logger", "launcher"),
-    *("stages", "debug", "sweep", "watch", "optimized_metric", "trust", "variant_prefix"),
+    *("stages", "debug", "sweep", "watch", "optimized_metric", "trust", "variant_prefix", "metrics"),
 }
 """Top-level settings that say where and how a run goes on, not what it computes."""
 
