@@ -96,8 +96,8 @@ def run_steps(
         cfg.output_dir, cfg.trainer.max_steps = folder, warm_up + timed + 2
         module = build_module(cfg, build_model(cfg, pretrained=False))
         batch = random_batch(cameras, module.model, cfg.views.batch_size, module.stage.targets)
-        card = {"stage": module.stage.name, "preset": cfg.preset, "config": plain(cfg)}
-        trainer = build_trainer(cfg, RunConfig.read(cfg), card, StageCallback())
+        metadata = {"stage": module.stage.name, "preset": cfg.preset, "config": plain(cfg)}
+        trainer = build_trainer(cfg, RunConfig.read(cfg), metadata, StageCallback())
         device.adopt(trainer)
         watch = _Watch(device, warm_up, timed, clock)
         trainer.callbacks.append(watch)

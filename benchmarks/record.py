@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from raytran.checkpoints.card import git_commit
+from raytran.checkpoints.metadata import git_commit
 from raytran.data.files import whole_file
 
 

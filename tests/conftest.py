@@ -22,8 +22,8 @@ if not torch.cuda.is_available():
     # Without a GPU Triton's kernels run in its interpreter. Triton reads this when it is first imported.
     os.environ["TRITON_INTERPRET"] = "1"
 
-from raytran.checkpoints.card import checkpoint_card
 from raytran.checkpoints.file import write_checkpoint
+from raytran.checkpoints.metadata import checkpoint_metadata
 from raytran.geometry.camera import Cameras
 from raytran.geometry.rotation import rotation_from_yaw, yaw_from_rotation
 from raytran.ops.pairs import PairList
@@ -235,12 +235,12 @@ def trained(tmp_path_factory):
     config = compose("train", [*settings, "data.root=/home/me/rooms", f"output_dir={folder}"])
     model = build_model(config, pretrained=False)
     parent = {"path": "/home/me/stage2/last.ckpt", "stage": "stage2", "step": 3, "scores": {"val/loss": 1.0}}
-    card = checkpoint_card(stage="stage3", preset="tiny", config=plain(config), parent=parent)
+    metadata = checkpoint_metadata(stage="stage3", preset="tiny", config=plain(config), parent=parent)
     state = {f"model.{name}": value for name, value in model.state_dict().items()}
     scores = {"val/objects/f1_0.25": 0.5, "val/objects/f1_0.25/chair": 0.7}
     more = {"scores": scores, "global_step": 40, "optimizer_states": [{}]}
     path = folder / "last.ckpt"
-    write_checkpoint(path, {**card, **more, "state_dict": {**state, "loss.scale": torch.ones(1)}})
+    write_checkpoint(path, {**metadata, **more, "state_dict": {**state, "loss.scale": torch.ones(1)}})
     return Trained(path, model)
 
 

@@ -22,8 +22,8 @@ from torch.utils.data import DataLoader
 
 from raytran.capture.lens import Lens
 from raytran.capture.render_cameras import RenderCameras
-from raytran.checkpoints.card import checkpoint_card
 from raytran.checkpoints.file import read_checkpoint
+from raytran.checkpoints.metadata import checkpoint_metadata
 from raytran.checkpoints.runs import LAST
 from raytran.data.collate import collate_scenes
 from raytran.errors import NonFiniteError
@@ -157,8 +157,8 @@ def trainer_of(cfg, folder, *, steps, validate_every=None, callbacks=()):
     cfg.output_dir, cfg.precision, cfg.progress_bar = str(folder), "bf16-mixed", "none"
     cfg.trainer.update({"accelerator": NAME, "strategy": NAME, "max_steps": steps})
     cfg.trainer.val_check_interval = validate_every or steps
-    card = checkpoint_card(stage=cfg.stage.name, preset=cfg.preset, config=plain(cfg), parent=None)
-    trainer = build_trainer(cfg, RunConfig.read(cfg), card, StageCallback())
+    metadata = checkpoint_metadata(stage=cfg.stage.name, preset=cfg.preset, config=plain(cfg), parent=None)
+    trainer = build_trainer(cfg, RunConfig.read(cfg), metadata, StageCallback())
     trainer.precision_plugin.device = NAME  # Lightning takes every accelerator but the CPU for CUDA
     trainer.callbacks.extend(callbacks)
     return trainer

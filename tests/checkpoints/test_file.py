@@ -13,11 +13,11 @@ import torch
 from raytran.checkpoints.file import FORMAT, read_checkpoint, read_newest, write_checkpoint, write_weights
 from raytran.errors import CheckpointError
 
-CARD = {"format": FORMAT, "stage": "stage2", "preset": "tiny", "model": {}, "views": {}}
+METADATA = {"format": FORMAT, "stage": "stage2", "preset": "tiny", "model": {}, "views": {}}
 
 
 def content(value=0.0, **changes):
-    return {**CARD, "state_dict": {"weight": torch.arange(1000.0) + value}, **changes}
+    return {**METADATA, "state_dict": {"weight": torch.arange(1000.0) + value}, **changes}
 
 
 def weight(path):
@@ -48,17 +48,17 @@ def test_what_is_written_is_read_without_trust(path):
 def test_stages_of_earlier_checkpoints_have_their_present_names(tmp_path, ending):
     path = tmp_path / f"old.{ending}"
     stage = {"name": "view", "parent": "occupancy", "other_parents": ["joint", "shape"], "terms": ["view"]}
-    card = {
-        **CARD,
+    metadata = {
+        **METADATA,
         "format": "raytran.checkpoint/1",
         "stage": "view",
         "parent": {"stage": "occupancy", "step": 3},
         "config": {"stage": stage, "schedule": {"batch": 2, "joint": {"steps": 5}}, "loss": {"shape": 1.0}},
     }
     if ending == "ckpt":
-        write_checkpoint(path, {**card, "state_dict": {}})
+        write_checkpoint(path, {**metadata, "state_dict": {}})
     else:
-        write_weights(path, card, {})
+        write_weights(path, metadata, {})
     found = read_checkpoint(path)
     assert (found["stage"], found["parent"]) == ("novel_view", {"stage": "stage1", "step": 3})
     assert found["config"] == {

@@ -11,9 +11,9 @@ from hydra.utils import instantiate
 
 import raytran
 from raytran.checkpoints import file as module
-from raytran.checkpoints.card import DataIdentity
 from raytran.checkpoints.file import DEFAULT, FOLDER, checkpoint_path, export_weights, read_checkpoint
 from raytran.checkpoints.load import load_model, prediction_settings
+from raytran.checkpoints.metadata import DataIdentity
 from raytran.errors import CheckpointError
 from raytran.run.entry import compose
 from raytran.run.train.parent import find_parent

@@ -13,7 +13,13 @@ from safetensors.torch import load_file, save_file
 from raytran.checkpoints.file import FORMAT, read_checkpoint, write_checkpoint, write_weights
 from raytran.errors import CheckpointError
 
-CARD = {"format": FORMAT, "stage": "stage2", "preset": "tiny", "model": {"a": [1, 2.5, None]}, "views": {}}
+METADATA = {
+    "format": FORMAT,
+    "stage": "stage2",
+    "preset": "tiny",
+    "model": {"a": [1, 2.5, None]},
+    "views": {},
+}
 WEIGHTS = {
     "a.weight": torch.arange(1000.0).view(10, 100),
     "a.steps": torch.tensor(7),
@@ -25,7 +31,7 @@ WEIGHTS = {
 @pytest.fixture
 def path(tmp_path):
     path = tmp_path / "weights" / "rooms.safetensors"
-    write_weights(path, CARD, WEIGHTS)
+    write_weights(path, METADATA, WEIGHTS)
     return path
 
 
@@ -50,7 +56,7 @@ def same_weights(found, expected):
 
 def test_what_is_written_is_read_as_a_checkpoint(path):
     content = read_checkpoint(path)
-    assert {name: content[name] for name in CARD} == CARD
+    assert {name: content[name] for name in METADATA} == METADATA
     same_weights(content["state_dict"], {f"model.{name}": value for name, value in WEIGHTS.items()})
     assert [file.name for file in path.parent.iterdir()] == ["rooms.safetensors"]
 
@@ -58,19 +64,19 @@ def test_what_is_written_is_read_as_a_checkpoint(path):
 def test_any_program_opens_it(path):
     same_weights(load_file(path), WEIGHTS)
     header = parts(path)[0]["__metadata__"]
-    assert (header["format"], json.loads(header["raytran"])) == ("pt", CARD)
+    assert (header["format"], json.loads(header["raytran"])) == ("pt", METADATA)
 
 
 def test_tensors_that_share_memory_are_written(tmp_path):
     both = torch.arange(6.0)
-    write_weights(tmp_path / "a.safetensors", CARD, {"a": both, "b": both, "c": both.view(2, 3).t()})
+    write_weights(tmp_path / "a.safetensors", METADATA, {"a": both, "b": both, "c": both.view(2, 3).t()})
     assert torch.equal(load_file(tmp_path / "a.safetensors")["c"], both.view(2, 3).t())
 
 
 def test_another_name(path, tmp_path):
     as_ckpt = path.rename(tmp_path / "weights.ckpt")
     assert read_checkpoint(as_ckpt)["stage"] == "stage2"
-    write_checkpoint(tmp_path / "a.ckpt", {**CARD, "state_dict": WEIGHTS})
+    write_checkpoint(tmp_path / "a.ckpt", {**METADATA, "state_dict": WEIGHTS})
     as_weights = (tmp_path / "a.ckpt").rename(tmp_path / "a.safetensors")
     with pytest.raises(CheckpointError, match="no safetensors file"):
         read_checkpoint(as_weights)
@@ -86,10 +92,12 @@ def test_a_file_cut_short_is_one_sentence(path, share):
         read_checkpoint(path)
 
 
-@pytest.mark.parametrize("what", ["weight", "card", "name"])
+@pytest.mark.parametrize("what", ["weight", "metadata", "name"])
 def test_one_wrong_bit_is_found(path, what):
     file = bytearray(path.read_bytes())
-    looked_for = {"weight": torch.tensor(500.0).numpy().tobytes(), "card": b"2.5", "name": b"b.half"}[what]
+    looked_for = {"weight": torch.tensor(500.0).numpy().tobytes(), "metadata": b"2.5", "name": b"b.half"}[
+        what
+    ]
     file[file.index(looked_for)] ^= 1
     path.write_bytes(file)
     assert len(load_file(path)) == len(WEIGHTS), "safetensors itself notices: this test proves nothing"
@@ -115,15 +123,15 @@ def test_a_strangers_file_is_refused(tmp_path):
     ],
 )
 def test_another_card_is_refused(tmp_path, changes, message):
-    write_weights(tmp_path / "other.safetensors", {**CARD, **changes}, WEIGHTS)
+    write_weights(tmp_path / "other.safetensors", {**METADATA, **changes}, WEIGHTS)
     with pytest.raises(CheckpointError, match=message):
         read_checkpoint(tmp_path / "other.safetensors")
 
 
-@pytest.mark.parametrize("card", ["", "{", "[]", "3", "[" * 100_000, '{"a": "' + "x" * 2_000_000 + '"}'])
-def test_a_made_up_card_is_refused(path, card):
+@pytest.mark.parametrize("metadata", ["", "{", "[]", "3", "[" * 100_000, '{"a": "' + "x" * 2_000_000 + '"}'])
+def test_a_made_up_card_is_refused(path, metadata):
     header, data = parts(path)
-    header["__metadata__"]["raytran"] = card
+    header["__metadata__"]["raytran"] = metadata
     put_together(path, header, data)
     with pytest.raises(CheckpointError, match=r"rooms\.safetensors"):
         read_checkpoint(path)
@@ -173,7 +181,7 @@ def test_a_full_disk_is_one_sentence_and_keeps_what_is_there(path):
     resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
     try:
         with pytest.raises(CheckpointError, match=r"cannot write .*rooms\.safetensors .*: make room there"):
-            write_weights(path, CARD, {"weight": torch.zeros(100_000)})
+            write_weights(path, METADATA, {"weight": torch.zeros(100_000)})
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert path.read_bytes() == before

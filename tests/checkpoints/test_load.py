@@ -8,9 +8,9 @@ import pytest
 import torch
 
 import raytran
-from raytran.checkpoints.card import checkpoint_card
 from raytran.checkpoints.file import write_checkpoint
 from raytran.checkpoints.load import fresh_parts, load_weights, prediction_settings
+from raytran.checkpoints.metadata import checkpoint_metadata
 from raytran.errors import CheckpointError
 from raytran.run.entry import compose
 from raytran.run.train.build import build_model, plain
@@ -26,10 +26,10 @@ def saved(config, tmp_path):
     """A checkpoint as training writes it, and the model in it."""
     model = build_model(config)
     parent = {"path": "stage1.ckpt", "stage": "stage1", "step": 3, "scores": {}}
-    card = checkpoint_card(stage="stage2", preset="tiny", config=plain(config), parent=parent)
+    metadata = checkpoint_metadata(stage="stage2", preset="tiny", config=plain(config), parent=parent)
     state = {f"model.{name}": value for name, value in model.state_dict().items()}
     path = tmp_path / "last.ckpt"
-    write_checkpoint(path, {**card, "state_dict": state})
+    write_checkpoint(path, {**metadata, "state_dict": state})
     return path, model
 
 

@@ -70,8 +70,8 @@ def test_a_stranger_is_not_even_imported(config, marked, place):
     [
         "os.system",
         "builtins.eval",
-        "raytran.checkpoints.card.subprocess.run",  # reached through a module of ours
-        "raytran.checkpoints.card.git_commit",  # ours, and no network
+        "raytran.checkpoints.metadata.subprocess.run",  # reached through a module of ours
+        "raytran.checkpoints.metadata.git_commit",  # ours, and no network
         "raytran.backbone.resnet.torch.hub.load",
         "raytran.heads.shape.Tensor",  # imported there, defined elsewhere
         "raytran.backbone.resnet.nn.Linear",

@@ -38,14 +38,14 @@ def kernel(script):
 @pytest.fixture(scope="module")
 def untrained(tmp_path_factory):
     """A network that has learned nothing, for a package without weights."""
-    from raytran.checkpoints.card import checkpoint_card
     from raytran.checkpoints.file import write_checkpoint
+    from raytran.checkpoints.metadata import checkpoint_metadata
     from raytran.run.entry import compose
     from raytran.run.train.build import build_model, plain
 
     path = tmp_path_factory.mktemp("untrained") / "last.ckpt"
     config = compose("train", ["preset=tiny", "model.grid_resolution=[8,8,4]", f"output_dir={path.parent}"])
-    card = checkpoint_card(stage="stage3", preset="tiny", config=plain(config), parent=None)
+    card = checkpoint_metadata(stage="stage3", preset="tiny", config=plain(config), parent=None)
     state = build_model(config, pretrained=False).state_dict()
     write_checkpoint(path, {**card, "state_dict": {f"model.{name}": value for name, value in state.items()}})
     return path

@@ -53,8 +53,8 @@ def test_a_defect_keeps_its_traceback():
         ("seed", "key=value"),
         ("resume=elsewhere.ckpt", "give resume=auto"),
         ("schedule.joint.steps=3", "schedule.joint.steps=3 is called schedule.stage2.steps=3 now"),
-        ("model.backbone.resnet.width=8", r"is called model\.backbone\.encoder\.width=8 now"),
-        ("model.heads.objects.windowed=true", r"is called model/extensions=\[windowed_attention\] now"),
+        ("model.backbone.resnet.width=8", "is called model.backbone.encoder.width=8 now"),
+        ("model.heads.objects.windowed=true", "is called model/extensions=[windowed_attention] now"),
     ],
 )
 def test_a_wrong_setting_is_one_sentence(tmp_path, typed, said, command):

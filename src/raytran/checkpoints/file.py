@@ -213,7 +213,7 @@ SUFFIX = ".safetensors"
 PREFIX = "model."
 """Of the network's weights among those of a checkpoint."""
 
-_MAX_CARD = 1 << 20
+_MAX_METADATA = 1 << 20
 """Characters of the header's JSON at most; those of the presets have some 3,000."""
 
 
@@ -225,12 +225,12 @@ def is_weights_file(path: Path) -> bool:
         return file.read(9)[8:] == b"{"
 
 
-def write_weights(path: Path, card: Mapping[str, Any], weights: Mapping[str, Tensor]) -> None:
+def write_weights(path: Path, metadata: Mapping[str, Any], weights: Mapping[str, Tensor]) -> None:
     """Write ``weights`` to ``path``, which appears whole or not at all; what was there is replaced.
 
     Args:
         path: the file.
-        card: what ``check_content`` asks for and anything else that is JSON, without ``state_dict``.
+        metadata: what ``check_content`` asks for and anything else that is JSON, without ``state_dict``.
         weights: the network's, named as in its ``state_dict``.
 
     Raises:
@@ -238,7 +238,7 @@ def write_weights(path: Path, card: Mapping[str, Any], weights: Mapping[str, Ten
     """
     # Copies, because safetensors takes no two tensors that share memory.
     copies = {name: value.detach().cpu().contiguous().clone() for name, value in weights.items()}
-    text = json.dumps(card, ensure_ascii=False)
+    text = json.dumps(metadata, ensure_ascii=False)
     header = {"format": "pt", "raytran": text, "sha256": _digest(text, copies)}
     # Not save_file, whose files only the owner may read.
     write_whole(path, save(copies, metadata=header))
@@ -269,16 +269,16 @@ def read_weights(path: Path) -> dict[str, Any]:
     try:
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
-            card = _parse(header.get("raytran"))
+            metadata = _parse(header.get("raytran"))
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
     except Exception as error:  # a made-up file can fail anywhere in the reader
         raise _damaged_weights(path) from error
-    if card is None:
+    if metadata is None:
         raise CheckpointError(
             f"{path} holds no network of raytran: its header does not say how to build one; "
             "give a file that `python -m raytran.export_model` wrote"
         )
-    content = {**card, "state_dict": {f"{PREFIX}{name}": value for name, value in weights.items()}}
+    content = {**metadata, "state_dict": {f"{PREFIX}{name}": value for name, value in weights.items()}}
     check_content(content, path)
     if _digest(header["raytran"], weights) != header.get("sha256"):
         raise _damaged_weights(path)
@@ -286,15 +286,15 @@ def read_weights(path: Path) -> dict[str, Any]:
 
 
 def _parse(text: str | None) -> dict[str, Any] | None:
-    """Return the card in a header, None if there is none."""
-    if text is None or len(text) > _MAX_CARD:
+    """Return the metadata in a header, None if there is none."""
+    if text is None or len(text) > _MAX_METADATA:
         return None
-    card = json.loads(text)
-    return card if isinstance(card, dict) else None
+    metadata = json.loads(text)
+    return metadata if isinstance(metadata, dict) else None
 
 
 def _digest(text: str, weights: Mapping[str, Tensor]) -> str:
-    """Return the SHA-256 of the card and of every tensor's name, type, shape and bytes."""
+    """Return the SHA-256 of the metadata and of every tensor's name, type, shape and bytes."""
     found = hashlib.sha256(text.encode())
     for name in sorted(weights):
         value = weights[name]
@@ -366,19 +366,19 @@ def export_weights(checkpoint: Mapping[str, Any], source: Path, output: Path, *,
         for name, value in checkpoint["state_dict"].items()
         if name.startswith(PREFIX)
     }
-    write_weights(output, _card(checkpoint), weights)
+    write_weights(output, _metadata(checkpoint), weights)
 
 
-def _card(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
+def _metadata(checkpoint: Mapping[str, Any]) -> dict[str, Any]:
     """Return what the file says of itself."""
-    card = {name: checkpoint[name] for name in _KEPT if name in checkpoint}
+    metadata = {name: checkpoint[name] for name in _KEPT if name in checkpoint}
     parent = checkpoint.get("parent")
     if isinstance(parent, Mapping):
-        card["parent"] = {name: parent.get(name) for name in ("stage", "step")}
+        metadata["parent"] = {name: parent.get(name) for name in ("stage", "step")}
     data = checkpoint.get("data")
     if isinstance(data, Mapping):
-        card["data"] = {name: data.get(name) for name in ("name", "annotation")}
-    return card | {"model": without_sources(checkpoint["model"])}
+        metadata["data"] = {name: data.get(name) for name in ("name", "annotation")}
+    return metadata | {"model": without_sources(checkpoint["model"])}
 
 
 def _converted(value: Tensor, dtype: torch.dtype, name: str) -> Tensor:

@@ -10,8 +10,8 @@ from typing import Any, cast
 
 import torch
 
-from raytran.checkpoints.card import input_mask
 from raytran.checkpoints.file import PREFIX, checkpoint_path, read_checkpoint
+from raytran.checkpoints.metadata import input_mask
 from raytran.checkpoints.network import build_network
 from raytran.errors import CheckpointError
 from raytran.model import RayTran
@@ -68,15 +68,15 @@ def prediction_settings(checkpoint: str | Path) -> PredictionSettings:
         CheckpointError: the file is missing or damaged.
     """
     path = checkpoint_path(checkpoint)
-    card = read_checkpoint(path)
-    views = card["views"]
+    metadata = read_checkpoint(path)
+    views = metadata["views"]
     try:
         height, width = map(int, views["image_size"])
         num_views = int(views["predict_views"])
     except (KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path} does not say which images its network wants: it is damaged") from error
-    mask = card.get("input_mask") or input_mask(card.get("config"))
-    return PredictionSettings(card["preset"], card["stage"], (height, width), num_views, mask)
+    mask = metadata.get("input_mask") or input_mask(metadata.get("config"))
+    return PredictionSettings(metadata["preset"], metadata["stage"], (height, width), num_views, mask)
 
 
 def model_from(checkpoint: Mapping[str, Any], path: Path, *, trust: Iterable[str] = ()) -> RayTran:

@@ -186,7 +186,7 @@ def first_ranks(name: str, choose: Callable[[], str]) -> str:
     """
     if "TORCHELASTIC_RUN_ID" not in os.environ or os.environ.get("WORLD_SIZE", "1") == "1":
         return choose()
-    # A store that torchrun keeps for its workers, in which a restarted group finds another shelf.
+    # torchrun keeps a key-value store for its workers; after a restart of the group the keys are new ones.
     key = f"raytran/{os.environ.get('TORCHELASTIC_RESTART_COUNT', '0')}/{name}"
     from torch.distributed import TCPStore
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a network is told of places in the volume: sines of positions, numbers of rays."""
+"""Position encodings: sines and cosines of points in the volume, and the six numbers that describe a ray."""
 
 from __future__ import annotations
 

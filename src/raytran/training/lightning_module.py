@@ -103,7 +103,10 @@ class Reconstruction(pl.LightningModule):
         )
 
     def _is_repeated(self, batch_idx: int) -> bool:
-        """Say whether a validation scene is there only to give every rank as many; they come one by one."""
+        """Return whether a validation scene is a repetition that only fills up the last ranks' share.
+
+        Validation batches hold one scene each, so that the number of the batch tells the scene.
+        """
         place = batch_idx * self.trainer.world_size + self.trainer.global_rank
         loader: Any = self.trainer.val_dataloaders
         return place >= len(loader.dataset)

@@ -8,8 +8,8 @@ import json
 import pytest
 from omegaconf import DictConfig, OmegaConf
 
-from raytran.checkpoints.card import checkpoint_card
 from raytran.checkpoints.file import shipped_weights, write_checkpoint
+from raytran.checkpoints.metadata import checkpoint_metadata
 from raytran.errors import ConfigError
 from raytran.run.demo.demo import _asked, demo
 from raytran.run.entry import compose
@@ -46,9 +46,9 @@ def test_a_network_of_ones_own_is_trusted_because_it_was_typed(tmp_path, mylab):
         f"data.root={tmp_path / 'rooms'}",
     ]
     cfg = compose("train", [*typed, "experiment=stage3", "output_dir=unused"])
-    card = checkpoint_card(stage="stage3", preset="tiny", config=plain(cfg), parent=None)
+    metadata = checkpoint_metadata(stage="stage3", preset="tiny", config=plain(cfg), parent=None)
     state = {f"model.{name}": value for name, value in build_model(cfg).state_dict().items()}
-    write_checkpoint(tmp_path / "last.ckpt", {**card, "state_dict": state})
+    write_checkpoint(tmp_path / "last.ckpt", {**metadata, "state_dict": state})
     asked = _asked(typed, build_data(cfg), tmp_path / "last.ckpt")
     assert type(asked["train"].model.backbone).__module__ == "mylab.nets"
 

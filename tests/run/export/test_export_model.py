@@ -48,11 +48,11 @@ def test_the_header_says_what_is_inside_and_nothing_of_the_machine(trained, tmp_
     with safe_open(exported(trained, tmp_path), framework="pt") as file:
         text, names = file.metadata()["raytran"], set(file.keys())
     assert names == set(trained.model.state_dict())
-    card = json.loads(text)
-    assert (card["stage"], card["preset"], card["global_step"]) == ("stage3", "tiny", 40)
-    assert card["parent"] == {"stage": "stage2", "step": 3}
-    assert card["versions"]["torch"] == torch.__version__
-    assert card["model"]["grid_resolution"] == [8, 8, 4]
+    metadata = json.loads(text)
+    assert (metadata["stage"], metadata["preset"], metadata["global_step"]) == ("stage3", "tiny", 40)
+    assert metadata["parent"] == {"stage": "stage2", "step": 3}
+    assert metadata["versions"]["torch"] == torch.__version__
+    assert metadata["model"]["grid_resolution"] == [8, 8, 4]
     assert "/home/me" not in text
     assert str(tmp_path.parent) not in text
 
@@ -125,10 +125,12 @@ def test_weights_that_do_not_fit_are_named(trained, tmp_path, value, dtype, mess
 
 
 def put(path, content, **model):
-    """Write a file whose card asks for another network than its weights are of."""
-    card = {name: value for name, value in content.items() if name not in ("state_dict", "optimizer_states")}
+    """Write a file whose metadata asks for another network than its weights are of."""
+    metadata = {
+        name: value for name, value in content.items() if name not in ("state_dict", "optimizer_states")
+    }
     state = {name.removeprefix("model."): value for name, value in content["state_dict"].items()}
-    write_weights(path, card | {"model": content["model"] | model}, state)
+    write_weights(path, metadata | {"model": content["model"] | model}, state)
 
 
 def test_a_file_cannot_run_foreign_code(trained, tmp_path):

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from raytran.checkpoints.card import DataIdentity, checkpoint_card
 from raytran.checkpoints.file import write_checkpoint
+from raytran.checkpoints.metadata import DataIdentity, checkpoint_metadata
 from raytran.checkpoints.runs import LAST, write_finished
 from raytran.errors import CheckpointError, ConfigError
 from raytran.run.entry import compose
@@ -117,9 +117,9 @@ def finished(outputs, name, data, *, old=False):
     """A finished stage 1; an old one does not say in its mark what it was trained on."""
     run = outputs / "tiny" / "stage1" / name
     config = plain(compose("train", ["preset=tiny", "output_dir=unused", *data]))
-    card = checkpoint_card(stage="stage1", preset="tiny", config=config, parent=None)
-    write_checkpoint(run / LAST, {**card, "state_dict": {}})
-    known = None if old else card["data"]
+    metadata = checkpoint_metadata(stage="stage1", preset="tiny", config=config, parent=None)
+    write_checkpoint(run / LAST, {**metadata, "state_dict": {}})
+    known = None if old else metadata["data"]
     write_finished(run, stage="stage1", preset="tiny", experiment="stage1", steps=4, data=known)
     return run / LAST
 

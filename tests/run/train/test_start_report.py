@@ -5,14 +5,14 @@ import re
 
 import pytest
 
-from raytran.checkpoints.card import DataIdentity, checkpoint_card
+from raytran.checkpoints.metadata import DataIdentity, checkpoint_metadata
 from raytran.run.entry import compose
 from raytran.run.train.build import build_model, build_module, plain
 from raytran.run.train.start_report import changed_settings, start_report
 
 
-def card(cfg, parent=None):
-    return checkpoint_card(stage=cfg.stage.name, preset=cfg.preset, config=plain(cfg), parent=parent)
+def metadata(cfg, parent=None):
+    return checkpoint_metadata(stage=cfg.stage.name, preset=cfg.preset, config=plain(cfg), parent=parent)
 
 
 @pytest.mark.parametrize(
@@ -25,7 +25,7 @@ def card(cfg, parent=None):
 def test_parts_and_counts(experiment, trained, frozen, terms):
     cfg = compose("train", ["preset=tiny", f"experiment={experiment}", "output_dir=unused"])
     module = build_module(cfg, build_model(cfg))
-    first, second, third = start_report(module.stage, module.model, card(cfg))
+    first, second, third = start_report(module.stage, module.model, metadata(cfg))
     assert first.startswith("trains ")
     assert all(f" {name} " in first for name in trained)
     assert second.startswith("frozen ")
@@ -43,7 +43,7 @@ def test_the_parent_is_named_with_its_score():
     module = build_module(cfg, build_model(cfg))
     scores = {"val/occupancy/iou": 0.41234, "val/total": 3.0}
     parent = {"path": "a/last.ckpt", "stage": "stage1", "step": 1500, "scores": scores}
-    last = start_report(module.stage, module.model, card(cfg, parent))[-1]
+    last = start_report(module.stage, module.model, metadata(cfg, parent))[-1]
     assert last == "starts from stage1, step 1500, val/occupancy/iou 0.412: a/last.ckpt"
 
 
@@ -54,17 +54,17 @@ def test_a_parent_on_other_data_is_said_in_one_line():
     parent = {"path": "a/last.ckpt", "stage": "stage1", "step": 1500, "scores": {}}
     rooms = DataIdentity.of_config(plain(compose("train", [*typed, "data.root=rooms"]))).as_plain()
     line = "its parent was trained on other data, rooms in rooms; this run on scan2cad in real"
-    assert line in start_report(module.stage, module.model, card(cfg, parent | {"data": rooms}))
-    same = card(cfg)["data"]
+    assert line in start_report(module.stage, module.model, metadata(cfg, parent | {"data": rooms}))
+    same = metadata(cfg)["data"]
     for quiet in (parent, parent | {"data": None}, parent | {"data": same}):
         assert not any(
-            "other data" in line for line in start_report(module.stage, module.model, card(cfg, quiet))
+            "other data" in line for line in start_report(module.stage, module.model, metadata(cfg, quiet))
         )
 
 
 def test_a_network_of_ones_own_says_what_its_checkpoints_need():
     cfg = compose("train", ["preset=tiny", "output_dir=unused"])
-    module, known = build_module(cfg, build_model(cfg)), card(cfg)
+    module, known = build_module(cfg, build_model(cfg)), metadata(cfg)
     known["model"]["backbone"]["_target_"] = "mylab.nets.MyBackbone"
     known["model"]["heads"]["shape"]["_target_"] = "friends.Head"
     line = start_report(module.stage, module.model, known)[-1]

@@ -16,7 +16,7 @@ from raytran.training.checkpoint_resume import random_states
 
 @pytest.fixture
 def callback(tmp_path, monkeypatch):
-    callback = LastCheckpoint(tmp_path / "last.ckpt", every_n_steps=5, card={})
+    callback = LastCheckpoint(tmp_path / "last.ckpt", every_n_steps=5, metadata={})
     monkeypatch.setattr(callback._signals, "listen", lambda world_size: None)
     return callback
 
@@ -90,7 +90,7 @@ def test_scores_are_kept_until_the_next_validation(callback):
     content = {}
     callback.on_save_checkpoint(trainer(), MODULE, content)
     assert content["scores"] == {"val/occupancy/iou": 0.25, "step": 7}
-    resumed = LastCheckpoint(callback._path, every_n_steps=5, card={})
+    resumed = LastCheckpoint(callback._path, every_n_steps=5, metadata={})
     resumed.on_load_checkpoint(trainer(), MODULE, checkpoint(scores=content["scores"]))
     later = {}
     resumed.on_save_checkpoint(trainer(), MODULE, later)

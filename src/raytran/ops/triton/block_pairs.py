@@ -31,11 +31,11 @@ _PIECES = [64 << power for power in range(12)] + [1 << 30]
 
 
 class BlockOrder(NamedTuple):
-    """The work of going along the tiles' rows, or along the blocks' rows.
+    """Work items of the kernels that compute a result for each pixel tile, or for each voxel block.
 
-    A row has the parts of the other side that it touches. One with very many (a block near a camera) is cut
-    into pieces. The kernels take one item each; what they find for a piece goes to a slot of scratch memory,
-    and a second pass adds up each row's slots.
+    A row is a tile or a block with the parts of the other side that it touches. One with very many (a block
+    near a camera) is cut into pieces. The kernels take one item each; what they find for a piece goes to a
+    slot of scratch memory, and a second pass adds up each row's slots.
 
     Attributes:
         part_start: ``(L,)`` int32, first element of each part, row after row.

@@ -11,7 +11,7 @@ from typing import Any
 
 from PIL import Image
 
-from raytran.checkpoints.card import provenance
+from raytran.checkpoints.metadata import provenance
 from raytran.pictures.curves import draw_curves
 from raytran.pictures.page import data_uri
 from raytran.pictures.page import write_page as fill_template

@@ -12,9 +12,9 @@ from omegaconf import DictConfig
 from rich.console import Console
 from rich.table import Table
 
-from raytran.checkpoints.card import DataIdentity
 from raytran.checkpoints.file import PREFIX, SUFFIX, checkpoint_path, export_weights, read_checkpoint
 from raytran.checkpoints.load import model_from, prediction_settings
+from raytran.checkpoints.metadata import DataIdentity
 from raytran.checkpoints.network import trusted_packages
 from raytran.errors import ConfigError
 from raytran.export.torch_program import SUFFIX as PROGRAM_SUFFIX

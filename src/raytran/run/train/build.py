@@ -86,13 +86,15 @@ def choose_precision(precision: str, *, on_cpu: bool) -> str:
     return "bf16-mixed" if torch.cuda.is_bf16_supported(including_emulation=False) else "16-mixed"
 
 
-def build_trainer(cfg: DictConfig, run: RunConfig, card: dict[str, Any], stage: StageCallback) -> pl.Trainer:
+def build_trainer(
+    cfg: DictConfig, run: RunConfig, metadata: dict[str, Any], stage: StageCallback
+) -> pl.Trainer:
     """Return Lightning's Trainer with the callbacks of every run.
 
     Args:
         cfg: the root config.
         run: the same config's switches.
-        card: what each checkpoint carries.
+        metadata: what each checkpoint carries.
         stage: what the stage is.
 
     Raises:
@@ -113,13 +115,13 @@ def build_trainer(cfg: DictConfig, run: RunConfig, card: dict[str, Any], stage: 
         EffectiveBatch(per_device=cfg.data.batch_size, expected=cfg.schedule.batch),
         RankAgreement(),
         RepeatedFramesWarning(),
-        LastCheckpoint(folder / LAST, every_n_steps=run.checkpoint_every, card=card),
-        *_monitors(cfg, folder, card["config"]),
+        LastCheckpoint(folder / LAST, every_n_steps=run.checkpoint_every, metadata=metadata),
+        *_monitors(cfg, folder, metadata["config"]),
         *_judges(cfg, folder),
     ]
     settings["enable_checkpointing"] = any(isinstance(callback, ModelCheckpoint) for callback in callbacks)
     if run.progress_bar == "rich":
-        callbacks.append(StepProgress(card["stage"]))
+        callbacks.append(StepProgress(metadata["stage"]))
     elif run.progress_bar == "tqdm":
         callbacks.append(TQDMProgressBar())
     loggers = [instantiate(logger, _convert_="all") for logger in plain(cfg.logger).values()]

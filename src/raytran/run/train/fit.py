@@ -16,9 +16,9 @@ from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from omegaconf import DictConfig, OmegaConf
 
-from raytran.checkpoints.card import DataIdentity, checkpoint_card, provenance
 from raytran.checkpoints.file import read_checkpoint, read_newest
 from raytran.checkpoints.load import load_weights
+from raytran.checkpoints.metadata import DataIdentity, checkpoint_metadata, provenance
 from raytran.checkpoints.runs import LAST, one_at_a_time, read_finished, write_finished
 from raytran.data.files import write_json, write_text
 from raytran.errors import CheckpointError, ConfigError
@@ -87,21 +87,21 @@ def _train(cfg: DictConfig, run: RunConfig, folder: Path) -> FitResult:
     config = plain(cfg)
     start = _start(cfg, run)
     module = start.module
-    card = checkpoint_card(
+    metadata = checkpoint_metadata(
         stage=module.stage.name,
         preset=run.preset,
         config=config,
         parent=start.stage.parent,
         warnings=start.stage.warnings,
     )
-    trainer = build_trainer(cfg, run, card, start.stage)
+    trainer = build_trainer(cfg, run, metadata, start.stage)
     device = trainer.strategy.root_device
     set_matmul_precision(run.matmul_precision, device)
     data = build_data(cfg)
     if trainer.is_global_zero:
         _describe_run(cfg, folder)
     _log.info("%s, %d steps, in %s", module.stage.name, trainer.max_steps, folder)
-    for line in start_report(module.stage, module.model, card, trust=run.trust):
+    for line in start_report(module.stage, module.model, metadata, trust=run.trust):
         _log.info("%s", line)
     warning = cudnn_warning(device, str(trainer.precision))
     if warning is not None:

@@ -8,8 +8,8 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from raytran.checkpoints.card import DataIdentity
 from raytran.checkpoints.file import checkpoint_path, read_checkpoint
+from raytran.checkpoints.metadata import DataIdentity
 from raytran.checkpoints.runs import finished_runs
 from raytran.errors import ConfigError
 from raytran.run.config_dir import config_dir

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
-from raytran.checkpoints.card import DataIdentity
+from raytran.checkpoints.metadata import DataIdentity
 from raytran.checkpoints.network import own_packages
 from raytran.model import RayTran
 from raytran.training.stage import Stage
@@ -34,14 +34,14 @@ _WAS_CALLED = {"data.dataset.input_mask": {True: "amodal", False: None}}
 
 
 def start_report(
-    stage: Stage, model: RayTran, card: Mapping[str, Any], *, trust: Collection[str] = ()
+    stage: Stage, model: RayTran, metadata: Mapping[str, Any], *, trust: Collection[str] = ()
 ) -> list[str]:
     """Return the lines to log at the start of a fit.
 
     Args:
         stage: the stage; it is applied to ``model``, as the fit will do.
         model: the network.
-        card: what the checkpoints will say of themselves, see ``checkpoint_card``.
+        metadata: what the checkpoints will say of themselves, see ``checkpoint_metadata``.
         trust: packages that the user has already named as trusted.
     """
     stage.freeze(model)
@@ -56,7 +56,7 @@ def start_report(
         f"frozen {_listed(frozen)}",
         f"loss terms {', '.join(stage.terms)}; heads that run {', '.join(stage.tasks)}",
     ]
-    parent = card["parent"]
+    parent = metadata["parent"]
     if parent is not None:
         scores = parent["scores"]
         told = [
@@ -64,11 +64,11 @@ def start_report(
         ]
         at = f"{parent['stage']}, step {parent['step']}"
         lines.append(f"starts from {', '.join([at, *told])}: {parent['path']}")
-        known, data = DataIdentity.of_plain(parent.get("data")), DataIdentity.of_plain(card["data"])
+        known, data = DataIdentity.of_plain(parent.get("data")), DataIdentity.of_plain(metadata["data"])
         if known is not None and data is not None and not known.is_same(data):
             lines.append(f"its parent was trained on other data, {known}; this run on {data}")
-    lines += [f"WARNING: {warning}" for warning in card["warnings"]]
-    own = own_packages(card["model"])
+    lines += [f"WARNING: {warning}" for warning in metadata["warnings"]]
+    own = own_packages(metadata["model"])
     if not set(own) <= set(trust):
         lines.append(
             f"this network has classes of {', '.join(own)}: to use its checkpoints, evaluate, predict "

@@ -30,7 +30,7 @@ class ContinuedLogger(Protocol):
 
 
 class LastCheckpoint(pl.Callback):
-    """Writes ``path``, puts the run's card into it, and continues a run from it exactly.
+    """Writes ``path``, puts the run's metadata into it, and continues a run from it exactly.
 
     A checkpoint is the state between two steps: after the validation that may follow the first, before the
     second. A run asked to stop during a long validation does not wait for its end; the validation is then
@@ -39,13 +39,13 @@ class LastCheckpoint(pl.Callback):
     Args:
         path: the file to write.
         every_n_steps: optimiser steps between two writings.
-        card: plain Python that every checkpoint carries: format, stage, preset, model config, versions, ….
+        metadata: plain Python that every checkpoint carries: format, stage, preset, network, versions, ….
     """
 
-    def __init__(self, path: Path, *, every_n_steps: int, card: Mapping[str, Any]) -> None:
+    def __init__(self, path: Path, *, every_n_steps: int, metadata: Mapping[str, Any]) -> None:
         self._path = path
         self._every_n_steps = every_n_steps
-        self._card = dict(card)
+        self._metadata = dict(metadata)
         self._signals = StopSignals()
         self._written_at = -1
         self._tried_at = -1
@@ -56,12 +56,12 @@ class LastCheckpoint(pl.Callback):
     def on_save_checkpoint(
         self, trainer: pl.Trainer, pl_module: pl.LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Add the card, the scores of the last validation and what an exact resume needs."""
+        """Add the metadata, the scores of the last validation and what an exact resume needs."""
         states = self._random or random_states(pl_module.device)
-        checkpoint.update(self._card)
+        checkpoint.update(self._metadata)
         data = checkpoint.get("data")
         if isinstance(data, dict) and data.get("root") is not None:
-            # Data that are made on first use were not there yet when the card was.
+            # Data that are made on first use were not there yet when the metadata was.
             checkpoint["data"] = {**data, "annotation": annotation_digest(Path(data["root"]))}
         checkpoint["scores"] = dict(self._scores)
         checkpoint["resume"] = {

@@ -12,8 +12,8 @@ from typing import Any
 import lightning.pytorch as pl
 from torch import nn
 
-from raytran.checkpoints.card import DataIdentity
 from raytran.checkpoints.load import fresh_parts, load_weights
+from raytran.checkpoints.metadata import DataIdentity
 from raytran.errors import CheckpointError
 from raytran.training.lightning_module import Reconstruction
 from raytran.training.stage import Stage

@@ -11,7 +11,7 @@ import torch
 import trimesh
 
 import raytran
-from raytran.checkpoints.card import git_commit, versions
+from raytran.checkpoints.metadata import git_commit, versions
 
 
 def git(folder, *arguments):
@@ -44,7 +44,7 @@ def test_a_package_installed_inside_another_repository_has_no_commit(tmp_path):
 
 def test_versions_name_the_build_of_torch(monkeypatch):
     """PyPI's wheel for CUDA calls itself 2.13.0 in its metadata."""
-    monkeypatch.setattr("raytran.checkpoints.card.metadata.version", lambda name: "1.0")
+    monkeypatch.setattr("raytran.checkpoints.metadata.version", lambda name: "1.0")
     assert versions()["torch"] == torch.__version__
     assert type(versions()["torch"]) is str  # checkpoints hold plain Python
 
@@ -60,5 +60,5 @@ def test_versions_are_those_that_run(monkeypatch):
     def none(name):
         raise metadata.PackageNotFoundError(name)
 
-    monkeypatch.setattr(metadata, "version", none)
+    monkeypatch.setattr("raytran.checkpoints.metadata.version", none)
     assert set(versions()) == {"python", "raytran", "torch"}, "what is not installed is left out"

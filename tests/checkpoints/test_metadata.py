@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from raytran.checkpoints.card import DataIdentity
+from raytran.checkpoints.metadata import DataIdentity
 from raytran.run.entry import compose
 from raytran.run.train.build import plain
 
