@@ -17,8 +17,7 @@ from torch import Tensor
 from raytran.backbone.backbone import Backbone
 from raytran.backbone.block import RayTracedBlock, Stream
 from raytran.geometry.camera import Cameras
-from raytran.geometry.grid import VoxelGrid
-from raytran.geometry.position import ray_code
+from raytran.geometry.grid import VoxelGrid, ray_code
 from raytran.model import TASKS, RayTran
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_attention import ray_attention

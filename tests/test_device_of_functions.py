@@ -13,8 +13,7 @@ from torch import Tensor
 from raytran.extensions.unprojection import pair_centers
 from raytran.geometry.boxes import OrientedBoxes, box_iou
 from raytran.geometry.camera import Cameras
-from raytran.geometry.grid import VoxelGrid
-from raytran.geometry.position import position_code, ray_code
+from raytran.geometry.grid import VoxelGrid, position_code, ray_code
 from raytran.geometry.rasterize import rasterize_mask
 from raytran.geometry.room_tiles import Volumes, cover
 from raytran.geometry.rotation import (
@@ -168,10 +167,10 @@ SOME_FOLDERS = ("geometry", "ops", "backbone", "heads", "extensions", "losses")
 COPIES = {
     "geometry/box_clip.py": {"_face_edges", "_crossings", "_clamped_flux"},
     "geometry/boxes.py": {"corners"},
-    "geometry/position.py": {"position_code"},
+    "geometry/grid.py": {"position_code"},
     "geometry/rotation.py": {"upright_basis"},
     "geometry/room_tiles.py": {"_offset", "corner_index"},
-    "heads/queries.py": {"forward"},
+    "heads/objects.py": {"forward"},
     "extensions/denoising.py": {"denoising_losses"},
     "losses/matcher.py": {"_match"},
     "losses/objects.py": {"yaw_from_vector"},

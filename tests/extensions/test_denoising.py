@@ -22,8 +22,7 @@ from raytran.extensions.proposal_queries import ProposalQueries
 from raytran.extensions.windowed_attention import WindowedAttention
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.heads.objects import ObjectHead
-from raytran.heads.queries import LearnedQueries, Queries
+from raytran.heads.objects import LearnedQueries, ObjectHead, Queries
 from raytran.losses.objects import Betas
 from raytran.structs import ObjectSet, RawObjects
 

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
+from raytran.backbone.backbone import ImageEncoder
 from raytran.backbone.encoder_weights import imagenet_or_random, load_state, read_state
-from raytran.backbone.image_features import ImageEncoder
 from raytran.errors import CheckpointError, ConfigError
 
 IMAGENET_URL = "https://download.pytorch.org/models/resnet18-f37072fd.pth"

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from torch import Tensor, nn
 
-from raytran.heads.queries import Queries
+from raytran.heads.objects import Queries
 from raytran.structs import RawObjects
 
 

@@ -17,9 +17,9 @@ from torch import Tensor, nn
 from raytran.errors import ConfigError
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.rotation import yaw_from_rotation
-from raytran.heads.objects import ObjectHead, ObjectOutputs
-from raytran.heads.queries import QUERY_SCALE, Queries
+from raytran.heads.objects import QUERY_SCALE, ObjectHead, ObjectOutputs, Queries
 from raytran.losses.objects import Betas, Match, object_losses
+from raytran.losses.total import ExtensionLoss
 from raytran.structs import CLASSES, ObjectSet, RawObjects, RawScene
 
 CENTER_NOISE = 0.5
@@ -170,16 +170,17 @@ def _select_queries(objects: RawObjects, which: slice) -> RawObjects:
     return RawObjects(*(getattr(objects, field.name)[:, which] for field in fields(objects)))
 
 
-class DenoisingLoss(nn.Module):
+class DenoisingLoss(ExtensionLoss):
     """The loss of the copies, a term of ``TotalLoss.extensions``."""
+
+    reads = "denoising"
 
     def forward(
         self, raw: RawScene, targets: Sequence[ObjectSet], *, num_objects: Tensor, betas: Betas
     ) -> dict[str, Tensor]:
-        """Return ``denoising_losses`` of what the network returned, nothing where it has no copies."""
-        if raw.denoising is None:
-            return {}
-        return denoising_losses([layer.in_float32() for layer in raw.denoising], targets, betas=betas)
+        """Return ``denoising_losses`` of what the network returned."""
+        layers = [layer.in_float32() for layer in raw.denoising or ()]
+        return denoising_losses(layers, targets, betas=betas)
 
 
 def denoising_losses(

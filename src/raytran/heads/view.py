@@ -9,8 +9,7 @@ from typing import Any
 from torch import Tensor, nn
 
 from raytran.geometry.camera import Cameras
-from raytran.geometry.grid import VoxelGrid
-from raytran.geometry.position import ray_code
+from raytran.geometry.grid import VoxelGrid, ray_code
 from raytran.heads.auxiliary import image_upsampler
 from raytran.ops.pairs import Pairs
 

@@ -1,19 +1,53 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sum of all losses that a stage of training minimises (RayTran §3.2)."""
+"""The losses of RayTran §3.2: dense terms, and the weighted sum of all that a stage of training minimises."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Literal, TypeVar
+from typing import Literal, TypeVar, cast
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from raytran.errors import ConfigError, DataError
 from raytran.losses.matcher import HungarianMatcher
 from raytran.losses.objects import Betas, Match, object_losses
-from raytran.losses.terms import foreground_loss, occupancy_loss, shape_loss, view_loss
-from raytran.structs import ObjectSet, RawObjects, RawScene, SceneBatch
+from raytran.structs import ObjectSet, RawObjects, RawScene, SceneBatch, Views
+
+
+def occupancy_loss(logits: Tensor, target: Tensor) -> Tensor:
+    """Return the binary cross entropy of logits and bool target, both ``(B, X, Y, Z)``; mean over voxels."""
+    return F.binary_cross_entropy_with_logits(logits.float(), target.float())
+
+
+def foreground_loss(logits: Tensor, target: Tensor) -> Tensor:
+    """Return the binary cross entropy of logits and bool target, both ``(B, N, H, W)``; mean over pixels."""
+    return F.binary_cross_entropy_with_logits(logits.float(), target.float())
+
+
+def shape_loss(logits: Tensor, target: Tensor, *, num_objects: Tensor) -> Tensor:
+    """Return the binary cross entropy, mean over cells, sum over objects divided by ``num_objects``.
+
+    Args:
+        logits: ``(M, S, S, S)``.
+        target: ``(M, S, S, S)`` bool.
+        num_objects: scalar.
+    """
+    entropy = F.binary_cross_entropy_with_logits(logits.float(), target.float(), reduction="none")
+    return entropy.flatten(1).mean(dim=1).sum() / num_objects
+
+
+def view_loss(logits: Tensor, target: Views) -> Tensor:
+    """Return the mean squared error of colours in [0, 1].
+
+    Args:
+        logits: ``(B, V, 3, H, W)``.
+        target: ``V`` photographs of each scene, taken by the cameras that were rendered.
+    """
+    return F.mse_loss(logits.float().sigmoid(), target.colors())
+
 
 WEIGHTS = ("occupancy", "foreground", "class", "center", "size", "yaw", "heat", "shape", "view")
 TERMS = ("occupancy", "foreground", "objects", "shape", "view")
@@ -21,6 +55,29 @@ SHAPE_LAYERS = ("last", "all")
 
 _T = TypeVar("_T")
 _U = TypeVar("_U")
+
+
+class ExtensionLoss(nn.Module, ABC):
+    """A further loss of the objects, for a part that the paper's network does not have.
+
+    Attributes:
+        reads: the field of ``RawScene`` that it is the loss of; it is called if the network returned that.
+    """
+
+    reads: str
+
+    @abstractmethod
+    def forward(
+        self, raw: RawScene, targets: Sequence[ObjectSet], *, num_objects: Tensor, betas: Betas
+    ) -> dict[str, Tensor]:
+        """Return scalars by the name of the weight that they get.
+
+        Args:
+            raw: what the network returned for B scenes.
+            targets: true objects of B scenes.
+            num_objects: scalar by which sums over objects are divided.
+            betas: of the poses' smooth L1.
+        """
 
 
 class TotalLoss(nn.Module):
@@ -34,8 +91,7 @@ class TotalLoss(nn.Module):
             each with its own matches and all alike, as class and pose; that decodes as many times the grids.
         center_beta: of the centre's smooth L1, see ``Betas``.
         yaw_beta: of the yaw's.
-        extensions: further terms of the objects by name, called as ``ProposalLoss``: from what the network
-            returned and the true objects to values that have names of weights. None for none (the paper).
+        extensions: further losses of the objects by name; None for none, as in the paper.
 
     Raises:
         ConfigError: a weight is missing or unknown, there is no such choice, or a beta is negative.
@@ -50,7 +106,7 @@ class TotalLoss(nn.Module):
         shape_layers: Literal["last", "all"] = "last",
         center_beta: float = Betas().center,
         yaw_beta: float = Betas().yaw,
-        extensions: Mapping[str, nn.Module] | None = None,
+        extensions: Mapping[str, ExtensionLoss] | None = None,
     ) -> None:
         super().__init__()
         if shape_layers not in SHAPE_LAYERS:
@@ -155,6 +211,8 @@ class TotalLoss(nn.Module):
             losses |= {f"objects/{name}{suffix}": value for name, value in found.items()}
         if "objects" in terms:
             for name, extension in self.extensions.items():
+                if getattr(raw, cast("ExtensionLoss", extension).reads) is None:
+                    continue
                 found = extension(raw, targets, num_objects=num_objects, betas=self.betas)
                 losses |= {f"objects/{term}/{name}": value for term, value in found.items()}
         return losses

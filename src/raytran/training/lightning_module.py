@@ -62,8 +62,12 @@ class Reconstruction(pl.LightningModule):
             Lightning hands all of it to the callbacks' ``on_train_batch_end``.
         """
         raw = self._run_model(batch)
-        losses = self._losses(raw, batch, mean_over_ranks=mean_over_ranks)
-        means = mean_over_ranks(torch.stack([value.detach() for value in losses.values()]))
+        several = torch.distributed.is_available() and torch.distributed.is_initialized()
+        over_ranks = mean_over_ranks if several else None
+        losses = self._losses(raw, batch, mean_over_ranks=over_ranks)
+        means = torch.stack([value.detach() for value in losses.values()])
+        if over_ranks is not None:
+            means = over_ranks(means)
         logged = dict(zip(losses, means, strict=True))
         for name, value in logged.items():
             self.log(f"train/{name}", value, prog_bar=name == "total")

@@ -4,7 +4,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from raytran.losses.terms import shape_loss, view_loss
+from raytran.losses.total import shape_loss, view_loss
 from raytran.structs import Views
 
 

@@ -6,8 +6,7 @@ import math
 import torch
 
 from raytran.geometry.camera import Cameras
-from raytran.geometry.grid import VoxelGrid
-from raytran.geometry.position import position_code, ray_code
+from raytran.geometry.grid import VoxelGrid, position_code, ray_code
 
 
 def test_lowest_wave_spans_twice_the_volume_and_highest_a_sixteenth() -> None:
