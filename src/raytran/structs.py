@@ -55,7 +55,7 @@ CLASS_COLORS: tuple[tuple[int, int, int], ...] = (
 """Red, green, blue in [0, 255] of each class, in the order of ``CLASSES``, in pictures and meshes alike."""
 
 PADDING: int = len(CLASSES)
-"""Label of the padding class: the query slot holds no object."""
+"""Label of the padding class: the query holds no object."""
 
 SHAPE_SIZE: int = 63
 """Cells along each side of an object's shape grid (RayTran §3.2)."""

@@ -16,10 +16,10 @@ WEIGHTS = {"class": 1.0, "center": 2.0, "size": 1.0, "yaw": 1.0}
 @pytest.mark.parametrize("blind", [(), ("class",), ("center",), ("size", "yaw")])
 def test_finds_a_planted_permutation(make_objects, make_perfect, blind) -> None:
     """Also when some of the terms weigh nothing: each of the others tells the objects apart."""
-    objects, slots = make_objects(5), torch.tensor([7, 2, 9, 0, 4])
+    objects, queries = make_objects(5), torch.tensor([7, 2, 9, 0, 4])
     matcher = HungarianMatcher(weights={**WEIGHTS, **dict.fromkeys(blind, 0.0)})
-    (match,) = matcher(make_perfect(objects, slots, 10), [objects])
-    assert dict(zip(match.slot.tolist(), match.target.tolist(), strict=True)) == {
+    (match,) = matcher(make_perfect(objects, queries, 10), [objects])
+    assert dict(zip(match.query.tolist(), match.target.tolist(), strict=True)) == {
         7: 0,
         2: 1,
         9: 2,
@@ -41,10 +41,10 @@ def test_a_likely_class_costs_less(make_objects) -> None:
 
 
 def test_the_class_may_cost_its_cross_entropy(make_objects) -> None:
-    """A slot that is sure of a wrong class then loses its object to one that is nowhere near."""
+    """A query that is sure of a wrong class then loses its object to one that is nowhere near."""
     objects = replace(make_objects(1), label=torch.tensor([3]))
     logits = torch.zeros(1, 2, PADDING + 1)
-    logits[0, 0, 6] = 12.0  # slot 0 stands where the object does, slot 1 a metre away
+    logits[0, 0, 6] = 12.0  # query 0 stands where the object does, query 1 a metre away
     center = objects.center + torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     raw = RawObjects(
         logits, center[None], objects.size.log().expand(1, 2, 3), torch.zeros(1, 2, 2), torch.zeros(1, 2, 4)
@@ -52,7 +52,7 @@ def test_the_class_may_cost_its_cross_entropy(make_objects) -> None:
     chosen = {}
     for class_cost in ("probability", "cross_entropy"):
         matcher = HungarianMatcher(weights=WEIGHTS, class_cost=class_cost)
-        chosen[class_cost] = int(matcher(raw, [objects])[0].slot)
+        chosen[class_cost] = int(matcher(raw, [objects])[0].query)
     assert chosen == {"probability": 0, "cross_entropy": 1}
     only_class = HungarianMatcher(weights=WEIGHTS | {"center": 0, "yaw": 0}, class_cost="cross_entropy")
     expected = torch.nn.functional.cross_entropy(logits[0], torch.tensor([3, 3]), reduction="none")
@@ -90,7 +90,7 @@ def test_more_objects_than_slots_and_none(make_objects, make_perfect) -> None:
     (match,) = matcher(raw, [objects])
     assert sorted(match.target.tolist()) == [0, 1, 2]
     (match,) = matcher(raw, [ObjectSet.empty()])
-    assert len(match.slot) == len(match.target) == 0
+    assert len(match.query) == len(match.target) == 0
 
 
 def test_survives_numbers_that_are_not_finite(make_objects, make_perfect) -> None:
@@ -98,4 +98,4 @@ def test_survives_numbers_that_are_not_finite(make_objects, make_perfect) -> Non
     raw = make_perfect(objects, torch.arange(2), 3)
     broken = replace(raw, center=torch.full_like(raw.center, torch.nan))
     (match,) = HungarianMatcher(weights=WEIGHTS)(broken, [objects])
-    assert len(match.slot) == 2
+    assert len(match.query) == 2

@@ -72,7 +72,7 @@ def test_pose_terms_are_means_over_objects(make_objects, make_perfect) -> None:
 
 @pytest.mark.parametrize("padding", [0.1, 1.0, 0.0])
 def test_class_term_is_the_weighted_mean_over_all_slots(padding, make_objects) -> None:
-    """As torch's own mean with class weights: by the total weight of matched and of empty slots."""
+    """As torch's own mean with class weights: by the total weight of matched and of empty queries."""
     scenes = [make_objects(count, seed) for seed, count in enumerate((2, 1))]
     g = torch.Generator().manual_seed(5)
     raw = RawObjects(*(torch.randn(2, 5, size, generator=g) for size in (10, 3, 3, 2, 4)))
@@ -80,7 +80,7 @@ def test_class_term_is_the_weighted_mean_over_all_slots(padding, make_objects) -
     loss = TotalLoss(weights=WEIGHTS, matcher=matcher, no_object_weight=padding)
     label = torch.full((2, 5), PADDING)
     for scene, match in enumerate(matcher(raw, scenes)):
-        label[scene, match.slot] = scenes[scene].label[match.target]
+        label[scene, match.query] = scenes[scene].label[match.target]
     weight = torch.ones(PADDING + 1)
     weight[PADDING] = padding
     expected = torch.nn.functional.cross_entropy(
@@ -96,7 +96,7 @@ def join(*parts: RawStruct) -> RawStruct:
 
 @pytest.mark.parametrize("counts", [(3, 1), (2, 0), (1, 0), (0, 0), (6, 2)])
 def test_ranks_of_one_scene_take_the_step_of_one_rank(counts, make_objects) -> None:
-    """Sums over objects and slots have one divisor for all ranks: the mean over ranks is the whole."""
+    """Sums over objects and queries have one divisor for all ranks: the mean over ranks is the whole."""
     scenes = [make_objects(count, seed) for seed, count in enumerate(counts)]
     g = torch.Generator().manual_seed(5)
     raws = [RawObjects(*(torch.randn(1, 4, size, generator=g) for size in (10, 3, 3, 2, 4))) for _ in counts]
@@ -153,15 +153,15 @@ def test_everything_is_float32_under_autocast(make_objects) -> None:
 
 
 def test_shape_is_decoded_for_matched_slots_only(make_objects, make_perfect) -> None:
-    objects, slots = make_objects(2), torch.tensor([3, 1])
+    objects, queries = make_objects(2), torch.tensor([3, 1])
     asked = []
 
     def decode(embedding: torch.Tensor) -> torch.Tensor:
         asked.append(embedding[:, 0].tolist())
-        wanted = objects.shape[(embedding[:, 0] == 1).long()]  # slot 3 is object 0, slot 1 is object 1
+        wanted = objects.shape[(embedding[:, 0] == 1).long()]  # query 3 is object 0, query 1 is object 1
         return 40.0 * wanted.float() - 20.0
 
-    scene = RawScene(torch.zeros(1, 3), objects=(make_perfect(objects, slots, 4),))
+    scene = RawScene(torch.zeros(1, 3), objects=(make_perfect(objects, queries, 4),))
     losses = total_loss()(scene, batch(objects), terms=("shape",), decode_shapes=decode)
     assert sorted(asked[0]) == [1.0, 3.0]
     assert set(losses) == {"shape", "total"}
@@ -170,10 +170,10 @@ def test_shape_is_decoded_for_matched_slots_only(make_objects, make_perfect) -> 
 
 @pytest.mark.parametrize("terms", [("shape",), ("objects", "shape")])
 def test_all_layers_may_tell_shapes(make_objects, make_perfect, terms) -> None:
-    """Each by its own matches: against sums of torch's own cross entropies over the slots that are right."""
+    """Each by its own matches: against sums of torch's own cross entropies over the right queries."""
     objects = make_objects(2)
-    slots = [torch.tensor(of_layer) for of_layer in ([3, 1], [0, 2], [2, 3])]
-    layers = tuple(make_perfect(objects, of_layer, 4) for of_layer in slots)
+    queries = [torch.tensor(of_layer) for of_layer in ([3, 1], [0, 2], [2, 3])]
+    layers = tuple(make_perfect(objects, of_layer, 4) for of_layer in queries)
     decode = torch.nn.Sequential(torch.nn.Linear(4, 125), torch.nn.Unflatten(1, (5, 5, 5)))
 
     def losses(**options: str) -> dict[str, torch.Tensor]:
@@ -184,7 +184,7 @@ def test_all_layers_may_tell_shapes(make_objects, make_perfect, terms) -> None:
     usual, every = losses(), losses(shape_layers="all")
     assert set(every) - set(usual) == {"shape/layer0", "shape/layer1"}
     assert all(torch.equal(every[name], value) for name, value in usual.items() if name != "total")
-    for name, layer, of_layer in zip(("shape/layer0", "shape/layer1", "shape"), layers, slots, strict=True):
+    for name, layer, of_layer in zip(("shape/layer0", "shape/layer1", "shape"), layers, queries, strict=True):
         expected = torch.nn.functional.binary_cross_entropy_with_logits(
             decode(layer.embedding[0, of_layer]), objects.shape.float()
         )

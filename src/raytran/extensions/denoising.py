@@ -77,7 +77,7 @@ class DenoisingObjectHead(ObjectHead):
 
 
 class NoisyCopies(nn.Module):
-    """Makes queries of the true objects of each scene: slot i is a copy of object i modulo M.
+    """Makes queries of the true objects of each scene: query i is a copy of object i modulo M.
 
     A copy's embedding is that of its class, its reference point lies near the object's centre. Where queries
     are proposed, size and yaw start near the true ones too, as a proposal's do; learned queries start from
@@ -140,7 +140,7 @@ class NoisyCopies(nn.Module):
 
 
 def copied_objects(num_objects: int, num_copies: int, device: torch.device) -> Tensor:
-    """Return which object each slot is a copy of, ``(D,)`` int64."""
+    """Return which object each query is a copy of, ``(D,)`` int64."""
     return torch.arange(num_copies, device=device) % num_objects
 
 
@@ -186,9 +186,9 @@ class DenoisingLoss(ExtensionLoss):
 def denoising_losses(
     layers: Sequence[RawObjects], targets: Sequence[ObjectSet], *, betas: Betas
 ) -> dict[str, Tensor]:
-    """Return the class and pose losses of the copies, means over slots, sums over decoder layers.
+    """Return the class and pose losses of the copies, means over queries, sums over decoder layers.
 
-    A scene without objects has slots that are copies of nothing: they count as slots without a loss.
+    A scene without objects has queries that are copies of nothing: they count as queries without a loss.
 
     Args:
         layers: predictions ``(B, D, ...)`` of every layer.
@@ -202,11 +202,11 @@ def denoising_losses(
     device = layers[-1].center.device
     copied, matches = [], []
     for objects in targets:
-        slots = torch.arange(count if len(objects) else 0, device=device)
+        queries = torch.arange(count if len(objects) else 0, device=device)
         copied.append(
             objects.select(copied_objects(len(objects), count, device)) if len(objects) else objects
         )
-        matches.append(Match(slots, slots))
+        matches.append(Match(queries, queries))
     slots_in_all = layers[-1].center.new_tensor(float(scenes * count))
     totals: dict[str, Tensor] = {}
     for layer in layers:

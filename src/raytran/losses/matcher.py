@@ -27,9 +27,9 @@ class HungarianMatcher(nn.Module):
     Args:
         weights: ``class``, ``center``, ``size`` and ``yaw``; other names are ignored, so that the weights of
             the loss can be given.
-        class_cost: what an object's class costs a slot that gives it the probability p. ``probability``: −p,
+        class_cost: what an object's class costs a query that gives it the probability p. ``probability``: −p,
             as in DETR; ``cross_entropy``: −log p, the loss itself as the paper has it, which is unbounded and
-            outweighs the pose of a slot that is sure of a wrong class.
+            outweighs the pose of a query that is sure of a wrong class.
         center_beta: of the centre's smooth L1, see ``Betas``.
         yaw_beta: of the yaw's.
 
@@ -54,16 +54,16 @@ class HungarianMatcher(nn.Module):
 
     @torch.no_grad()
     def forward(self, raw: RawObjects, targets: Sequence[ObjectSet]) -> list[Match]:
-        """Match one decoder layer's slots ``(B, Q, ...)`` with the objects of B scenes."""
+        """Match one decoder layer's queries ``(B, Q, ...)`` with the objects of B scenes."""
         return [self._match(raw, scene, objects) for scene, objects in enumerate(targets)]
 
     def _match(self, raw: RawObjects, scene: int, objects: ObjectSet) -> Match:
         device = raw.center.device
-        slot, target = linear_sum_assignment(self.cost(raw, scene, objects).cpu().numpy())
-        return Match(torch.as_tensor(slot, device=device), torch.as_tensor(target, device=device))
+        query, target = linear_sum_assignment(self.cost(raw, scene, objects).cpu().numpy())
+        return Match(torch.as_tensor(query, device=device), torch.as_tensor(target, device=device))
 
     def cost(self, raw: RawObjects, scene: int, objects: ObjectSet) -> Tensor:
-        """Return the cost ``(Q, M)`` of every slot of ``scene`` with every true object."""
+        """Return the cost ``(Q, M)`` of every query of ``scene`` with every true object."""
         errors = pose_errors(
             raw.center[scene, :, None],
             raw.log_size[scene, :, None],
@@ -76,7 +76,7 @@ class HungarianMatcher(nn.Module):
         return torch.nan_to_num(cost, nan=UNUSABLE, posinf=UNUSABLE, neginf=UNUSABLE)
 
     def _class_cost(self, logits: Tensor) -> Tensor:
-        """Return what each class costs each slot, ``(Q, K + 1)`` as the logits."""
+        """Return what each class costs each query, ``(Q, K + 1)`` as the logits."""
         if self.class_cost == "cross_entropy":
             return -logits.log_softmax(dim=-1)
         return -logits.softmax(dim=-1)

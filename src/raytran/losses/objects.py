@@ -20,11 +20,11 @@ class Match(NamedTuple):
     """Matched pairs of one scene.
 
     Attributes:
-        slot: ``(m,)`` int64, query slot of each pair.
+        query: ``(m,)`` int64, query of each pair.
         target: ``(m,)`` int64, true object of each pair; m = min(Q, M).
     """
 
-    slot: Tensor
+    query: Tensor
     target: Tensor
 
 
@@ -109,10 +109,10 @@ def object_losses(
     Args:
         raw: predictions of B scenes.
         targets: true objects of B scenes.
-        matches: pairs of slots and true objects.
+        matches: pairs of queries and true objects.
         num_objects: scalar by which the pose losses' sums are divided.
-        class_weight: scalar by which the cross entropies' weighted sum over slots is divided; the sum of the
-            weights gives their mean.
+        class_weight: scalar by which the cross entropies' weighted sum over queries is divided; the sum of
+            the weights gives their mean.
         no_object_weight: weight of the padding class in the cross entropy.
         betas: of the poses' smooth L1.
 
@@ -122,11 +122,11 @@ def object_losses(
     label = torch.full(raw.class_logits.shape[:2], PADDING, device=raw.class_logits.device)
     losses = {name: raw.center.new_zeros(()) for name in ("class", "center", "size", "yaw")}
     for scene, (objects, match) in enumerate(zip(targets, matches, strict=True)):
-        label[scene, match.slot] = objects.label[match.target]
+        label[scene, match.query] = objects.label[match.target]
         errors = pose_errors(
-            raw.center[scene, match.slot],
-            raw.log_size[scene, match.slot],
-            raw.yaw_vector[scene, match.slot],
+            raw.center[scene, match.query],
+            raw.log_size[scene, match.query],
+            raw.yaw_vector[scene, match.query],
             objects.select(match.target),
             betas,
         )

@@ -85,9 +85,9 @@ class TotalLoss(nn.Module):
 
     Args:
         weights: one weight per name in ``WEIGHTS``; all decoder layers count alike.
-        matcher: matches slots with true objects.
+        matcher: matches queries with true objects.
         no_object_weight: weight of the padding class in the cross entropy (0.1 in DETR).
-        shape_layers: which decoder layers tell the shapes of their matched slots: the ``last``, or ``all``,
+        shape_layers: which decoder layers tell the shapes of their matched queries: the ``last``, or ``all``,
             each with its own matches and all alike, as class and pose; that decodes as many times the grids.
         center_beta: of the centre's smooth L1, see ``Betas``.
         yaw_beta: of the yaw's.
@@ -131,8 +131,9 @@ class TotalLoss(nn.Module):
     ) -> dict[str, Tensor]:
         """Return the unweighted terms and their weighted sum ``total``, in float32 also under autocast.
 
-        Terms of objects are sums over objects, or over slots, divided by their number or total weight in all
-        scenes of the step. So the mean over ranks of the gradients is that of one rank with all the scenes.
+        Terms of objects are sums over objects, or over queries, divided by their number or total weight in
+        all scenes of the step. So the mean over ranks of the gradients is that of one rank with all the
+        scenes.
 
         Args:
             raw: what the network returned.
@@ -223,7 +224,7 @@ class TotalLoss(nn.Module):
         targets: Sequence[ObjectSet],
         mean_over_ranks: Callable[[Tensor], Tensor] | None,
     ) -> tuple[Tensor, Tensor]:
-        """Return the number of true objects and the slots' total weight in the cross entropy, a rank."""
+        """Return the number of true objects and the queries' total weight in the cross entropy, a rank."""
         scenes, queries = raw.class_logits.shape[:2]
         matched = sum(min(queries, len(objects)) for objects in targets)
         weight = matched + self.no_object_weight * (scenes * queries - matched)
@@ -246,14 +247,14 @@ def _matched_shape_loss(
     decode_shapes: Callable[[Tensor], Tensor],
     num_objects: Tensor,
 ) -> Tensor:
-    """Return the shape loss of the matched slots, and of them alone: a 63³ grid for each of Q is dear."""
+    """Return the shape loss of the matched queries, and of them alone: a 63³ grid for each of Q is dear."""
     if any(objects.shape is None and len(objects) > 0 for objects in targets):
         raise DataError(
             "the loss term shape needs shape grids in the batch: add shapes to the data set's targets"
         )
-    embedding = torch.cat([raw.embedding[i, match.slot] for i, match in enumerate(matches)])
+    embedding = torch.cat([raw.embedding[i, match.query] for i, match in enumerate(matches)])
     if not len(embedding):
-        # Decode one slot and count it nothing, so that every rank of a parallel run has gradients to add.
+        # Decode one query and count it nothing, so that every rank of a parallel run has gradients to add.
         return 0.0 * decode_shapes(raw.embedding[:1, 0]).float().sum()
     wanted = [o.shape[match.target] for o, match in zip(targets, matches, strict=True) if o.shape is not None]
     return shape_loss(decode_shapes(embedding), torch.cat(wanted), num_objects=num_objects)

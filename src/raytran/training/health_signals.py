@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Early signs of whether a DETR-like network learns: gradients by part, how the query slots are used."""
+"""Early signs of whether a DETR-like network learns: gradients by part, how the queries are used."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ def gradient_norms(model: nn.Module) -> dict[str, Tensor]:
 def slot_signals(
     objects: RawObjects, targets: Sequence[ObjectSet], matcher: HungarianMatcher
 ) -> dict[str, Tensor]:
-    """Return how the slots of all ranks are used, scalars in [0, 1]; all ranks must call this together.
+    """Return how the queries of all ranks are used, scalars in [0, 1]; all ranks must call this together.
 
     Returns:
-        ``class_accuracy``: share of the slots matched with an object whose surest class is that object's;
+        ``class_accuracy``: share of the queries matched with an object whose surest class is that object's;
         missing where no scene has objects. It should soon be better than that of guessing.
-        ``class_entropy``: entropy of a slot's class probabilities, mean over slots, 1 if all classes are
-        equally likely. Near 0 from the start it means that slots are confident without a reason.
-        ``slots_used``: share of the slots whose most likely class is an object's. It should approach the mean
-        number of objects over that of slots; if it stays 0, the padding class has won.
+        ``class_entropy``: entropy of a query's class probabilities, mean over queries, 1 if all classes are
+        equally likely. Near 0 from the start it means that queries are confident without a reason.
+        ``slots_used``: share of the queries whose most likely class is an object's. It should approach the
+        mean number of objects over that of queries; if it stays 0, the padding class has won.
     """
     objects = RawObjects(**{name: value.float() for name, value in vars(objects).items()})
     right, matched = _count_right(objects, targets, matcher(objects, targets))
@@ -54,10 +54,10 @@ def slot_signals(
 def _count_right(
     objects: RawObjects, targets: Sequence[ObjectSet], matches: Sequence[Match]
 ) -> tuple[Tensor, Tensor]:
-    """Return the number of matched slots whose surest class is right, and of all of them."""
+    """Return the number of matched queries whose surest class is right, and of all of them."""
     label = objects.class_logits.argmax(dim=-1)
     hits = [
-        label[scene, match.slot] == truth.label[match.target]
+        label[scene, match.query] == truth.label[match.target]
         for scene, (truth, match) in enumerate(zip(targets, matches, strict=True))
     ]
     every = torch.cat(hits).float()

@@ -108,7 +108,7 @@ class Health(pl.Callback):
     def _signals(
         self, module: pl.LightningModule, objects: RawObjects | None, batch: SceneBatch
     ) -> dict[str, float]:
-        """Return what is logged of a step: counts, gradients by part, how the query slots are used."""
+        """Return what is logged of a step: counts, gradients by part, how the queries are used."""
         signals = {"health/skipped_steps": float(self._skipped)}
         signals |= {f"health/gradient/{part}": norm for part, norm in self._norms.items()}
         signals["health/gradient/all"] = math.hypot(*self._norms.values())
