@@ -170,11 +170,7 @@ COPIES = {
     "geometry/grid.py": {"position_code"},
     "geometry/rotation.py": {"upright_basis"},
     "geometry/room_tiles.py": {"_offset", "corner_index"},
-    "heads/objects.py": {"forward"},
-    "extensions/denoising.py": {"denoising_losses"},
     "losses/matcher.py": {"_match"},
-    "losses/objects.py": {"yaw_from_vector"},
-    "losses/total.py": {"_divisors"},
     "ops/traverse.py": {"_clip"},
 }
 """Functions that copy Python's numbers to the device, for which the host waits: not to be added to."""

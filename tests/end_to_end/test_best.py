@@ -87,6 +87,18 @@ def test_a_run_that_has_not_learned_says_that_the_next_stage_will_refuse(tmp_pat
     assert "novel_view may start from it" in caplog.text
 
 
+@pytest.mark.parametrize("more", [(), ("early_stopping.patience=1",)])
+def test_a_score_that_no_validation_has_ends_no_run(tmp_path, six_steps, caplog, more):
+    """Lightning's callbacks alone would end it at its first validation."""
+    with caplog.at_level(logging.WARNING, "raytran"):
+        result = fit(six_steps, tmp_path, "optimized_metric=val/occupancy/iuo", *more)
+    assert result.steps == 6
+    assert (
+        caplog.text.count("validation has no val/occupancy/iuo (optimized_metric): no best.ckpt is kept") == 1
+    )
+    assert not (tmp_path / LAST).with_name(BEST_NAME).exists()
+
+
 @pytest.mark.parametrize(
     ("setting", "said"),
     [

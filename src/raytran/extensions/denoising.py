@@ -207,15 +207,15 @@ def denoising_losses(
             objects.select(copied_objects(len(objects), count, device)) if len(objects) else objects
         )
         matches.append(Match(queries, queries))
-    slots_in_all = layers[-1].center.new_tensor(float(scenes * count))
+    num_queries = layers[-1].center.new_full((), scenes * count)
     totals: dict[str, Tensor] = {}
     for layer in layers:
         found = object_losses(
             layer,
             copied,
             matches,
-            num_objects=slots_in_all,
-            class_weight=slots_in_all,
+            num_objects=num_queries,
+            class_weight=num_queries,
             no_object_weight=0.0,
             betas=betas,
         )

@@ -66,7 +66,9 @@ class LearnedQueries(nn.Module):
         scenes = voxels.shape[0]
         reference = (self.reference * self.extent).expand(scenes, -1, -1)
         log_size = torch.full_like(reference, math.log(TYPICAL_SIZE))
-        yaw_vector = reference.new_tensor([0.0, 1.0]).expand(*reference.shape[:2], 2)
+        # (sin, cos) of no rotation, (0, 1), made on the device: a copy to it would make the host wait.
+        no_yaw = torch.arange(2, dtype=reference.dtype, device=reference.device)
+        yaw_vector = no_yaw.expand(*reference.shape[:2], 2)
         return Queries(self.embedding.expand(scenes, -1, -1), reference, log_size, yaw_vector, None)
 
 

@@ -89,7 +89,9 @@ def yaw_from_vector(yaw_vector: Tensor) -> Tensor:
     This one is that of the vector on the unit circle, whatever its length; it only turns the vector.
     """
     length = torch.linalg.vector_norm(yaw_vector.detach(), dim=-1, keepdim=True)
-    unit = torch.where(length > 0, yaw_vector.detach() / length, yaw_vector.new_tensor([0.0, 1.0]))
+    # (sin, cos) of no rotation, (0, 1), made on the device: a copy to it would make the host wait.
+    no_yaw = torch.arange(2, dtype=yaw_vector.dtype, device=yaw_vector.device)
+    unit = torch.where(length > 0, yaw_vector.detach() / length, no_yaw)
     sin, cos = (unit + (yaw_vector - yaw_vector.detach())).unbind(dim=-1)
     return torch.atan2(sin, cos)
 

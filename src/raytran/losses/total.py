@@ -228,11 +228,16 @@ class TotalLoss(nn.Module):
         scenes, queries = raw.class_logits.shape[:2]
         matched = sum(min(queries, len(objects)) for objects in targets)
         weight = matched + self.no_object_weight * (scenes * queries - matched)
-        divisors = raw.center.new_tensor([sum(len(objects) for objects in targets), weight])
-        if mean_over_ranks is not None:
-            divisors = mean_over_ranks(divisors)
+        count = sum(len(objects) for objects in targets)
         # Without any object, one a scene. A bound of one a rank would be wrong: on two ranks it makes two.
-        num_objects, class_weight = torch.where(divisors > 0, divisors, float(scenes)).unbind()
+        without_any = float(scenes)
+        # Numbers are filled in on the device: a copy to it would make the host wait.
+        if mean_over_ranks is None:
+            return raw.center.new_full((), count or without_any), raw.center.new_full(
+                (), weight or without_any
+            )
+        means = mean_over_ranks(torch.stack([raw.center.new_full((), value) for value in (count, weight)]))
+        num_objects, class_weight = torch.where(means > 0, means, without_any).unbind()
         return num_objects, class_weight
 
     def _weight(self, name: str) -> float:

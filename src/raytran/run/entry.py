@@ -33,12 +33,17 @@ _RENAMED = (
     (r"experiment=objects_(\d+)", r"max_objects=\1"),
     (r"model\.backbone\.resnet\.", "model.backbone.encoder."),
     (r"model\.backbone\.norm_momentum=", "norm_momentum="),
+    (r"model\.backbone\.start_levels=0", "model.backbone.voxel_network=null"),
+    (r"model\.heads\.objects\.windowed=false", "model.heads.objects.voxel_attention=null"),
+    (r"model\.heads\.objects\.refines=center", "model.heads.objects.refinement=null"),
     (r"model\.backbone\.start_levels=.*", "model/extensions=[unet3d]"),
     (r"model\.heads\.objects\.windowed=.*", "model/extensions=[windowed_attention]"),
     (r"model\.heads\.objects\.refines=.*", "model/extensions=[box_refinement]"),
     (r"model\.heads\.objects\.num_copies=.*", "model/extensions=[denoising]"),
     (r"model=unprojection", "model/backbone=unprojection"),
-    (r"model/encoder=(tiny|small|raytran)", "model/encoder=resnet18"),
+    (r"model/encoder=raytran", "model/encoder=resnet18"),
+    (r"model/encoder=(tiny|small)", r"model/encoder=resnet18_\1"),
+    (r"model/encoder=laptop", "model/encoder=efficientnet_lite0_laptop"),
     *((rf"(stage=|schedule\.){old}\b", rf"\g<1>{new}") for old, new in STAGE_NAMES.items()),
 )
 """Settings of earlier versions as they were typed, and as they are typed now."""

@@ -18,7 +18,7 @@ from raytran.checkpoints.runs import LAST
 from raytran.errors import ConfigError
 from raytran.run.train.settings import RunConfig
 from raytran.training.callbacks.health import Health
-from raytran.training.callbacks.last_checkpoint import LastCheckpoint
+from raytran.training.callbacks.last_checkpoint import BestCheckpoint, LastCheckpoint
 from raytran.training.callbacks.run_checks import EffectiveBatch, RankAgreement, RepeatedFramesWarning
 from raytran.training.callbacks.scene_pictures import ScenePictures
 from raytran.training.callbacks.stage import StageCallback
@@ -151,7 +151,7 @@ def _judges(cfg: DictConfig, folder: Path) -> list[pl.Callback]:
         raise ConfigError(
             f"early_stopping.patience must be a number of validations or 0 for never, got {patience}"
         )
-    best = ModelCheckpoint(
+    best = BestCheckpoint(
         dirpath=(folder / LAST).parent,
         filename=Path(BEST_NAME).stem,
         monitor=metric,
@@ -161,7 +161,10 @@ def _judges(cfg: DictConfig, folder: Path) -> list[pl.Callback]:
     )
     if not patience:
         return [best]
-    return [best, EarlyStopping(metric, mode=mode, patience=patience, check_on_train_epoch_end=False)]
+    stopping = EarlyStopping(
+        metric, mode=mode, patience=patience, strict=False, check_on_train_epoch_end=False
+    )
+    return [best, stopping]
 
 
 def _monitors(cfg: DictConfig, folder: Path, settings: dict[str, Any]) -> list[pl.Callback]:

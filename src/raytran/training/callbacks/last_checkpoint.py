@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import lightning.pytorch as pl
+from lightning.pytorch.callbacks import ModelCheckpoint
 
 from raytran.data.scan2cad import annotation_digest
 from raytran.errors import CheckpointError
@@ -173,3 +174,20 @@ class LastCheckpoint(pl.Callback):
     def _stop(self, signum: int) -> None:
         _log.info("stopped; resume=auto continues from step %d", max(0, self._written_at))
         raise StopRequestedError(signum)
+
+
+class BestCheckpoint(ModelCheckpoint):
+    """Lightning's callback, but a validation without the monitored score ends no run: it is said once.
+
+    A score may be missing because no validation scene has an object, or because its name is mistyped.
+    """
+
+    _is_missing_told = False
+
+    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Keep the weights if their score is the best so far."""
+        if self.monitor in trainer.callback_metrics:
+            super().on_validation_end(trainer, pl_module)
+        elif trainer.is_global_zero and not self._is_missing_told:
+            self._is_missing_told = True
+            _log.warning("validation has no %s (optimized_metric): no best.ckpt is kept", self.monitor)
