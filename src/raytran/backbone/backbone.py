@@ -148,7 +148,8 @@ class VoxelBackbone(nn.Module, ABC):
         """Return features of the scene and of its views.
 
         The views of a scene come in chunks, one in training. A prediction from many views takes a few at a
-        time: the same result up to rounding, in less memory. Of all views only pairs and pixel features are kept.
+        time: the same result up to rounding, in less memory. Of all views only the pairs and the pixel
+        features are kept.
 
         Args:
             images: for each chunk of views ``(B, N, 3 or 4, H, W)`` uint8, or floating point in [0, 1].
