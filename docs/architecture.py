@@ -17,6 +17,7 @@ PICTURE = Path(__file__).with_suffix(".png")
 
 COLUMNS: tuple[dict[str, str], ...] = (
     {"structs": "batch, output,\nprediction", "errors": "one sentence\neach"},
+    {"limits": "what numbers\ncan mean"},
     {"geometry": "cameras, boxes,\nvoxel grid"},
     {"ops": "rays, pairs,\nsparse attention"},
     {"backbone": "images → voxels", "heads": "voxels → answers"},

@@ -10,6 +10,7 @@ import pytest
 
 LAYERS: list[set[str]] = [
     {"structs", "errors"},
+    {"limits"},
     {"geometry"},
     {"ops"},
     {"backbone", "heads"},

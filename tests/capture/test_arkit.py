@@ -119,7 +119,9 @@ def test_corrected_keyframes_come_first(walk):
 def test_what_is_wrong_is_named(walk):
     folder = write_scanner(walk, walk.folder.parent / "log")
     (folder / "frame_00004.json").write_text('{"intrinsics": [1]}')
-    with pytest.raises(DataError, match=r"frame_00004\.json has no cameraPoseARFrame of 4x4 numbers"):
+    with pytest.raises(
+        DataError, match=r"frame_00004\.json has no cameraPoseARFrame where numbers are needed"
+    ):
         read_arkit(folder)
     scenes = write_arkitscenes(walk, walk.folder.parent / "scenes") / "41254925_frames"
     next((scenes / "lowres_wide_intrinsics").iterdir()).write_text("64 48")

@@ -72,10 +72,13 @@ def test_a_focus_that_changes_is_followed(walk, folder):
     ("changes", "message"),
     [
         ({"poses": [[0, 0, 0, 1, 0, 0, 0]] * 9}, "has 9 poses and .*rgb 12 images: export both again"),
-        ({"poses": [[0, 0, 0, 1]]}, "has no poses of"),
-        ({"K": [1, 2]}, "has no K of 3x3 numbers"),
-        ({"w": None}, "has w = 'None' where a number is needed"),
-        ({"perFrameIntrinsicCoeffs": [[50, 51, 31, 25]] * 3}, "no perFrameIntrinsicCoeffs of 12x4 numbers"),
+        ({"poses": [[0, 0, 0, 1]]}, "poses in .* does not hold nx7 numbers"),
+        ({"K": [1, 2]}, "K in .* does not hold 3x3 numbers"),
+        ({"w": None}, "w in .* is None, not a number of pixels"),
+        (
+            {"perFrameIntrinsicCoeffs": [[50, 51, 31, 25]] * 3},
+            "perFrameIntrinsicCoeffs in .* does not hold 12x4 numbers",
+        ),
         ({"poses": [[0, 0, 0, 0, 0, 0, 0]] * 12}, "none of the 12 frames .*no rigid motion"),
     ],
 )

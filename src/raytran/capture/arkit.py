@@ -16,11 +16,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from raytran.capture.lens import Lens, check_lens
-from raytran.capture.recording import Frame, Recording, frame_name, images_in, number, numbers, read_json
-from raytran.capture.trajectory import Track, poses_at, read_table
+from raytran.capture.recording import Frame, Recording, frame_name, images_in, number, numbers
+from raytran.capture.trajectory import Track, poses_at
 from raytran.data.images import stored_size
 from raytran.data.scan import NO_IMAGE, NO_POSE, numbers_first
+from raytran.data.text import read_json_object, read_table
 from raytran.errors import DataError
+from raytran.limits import FOCAL_LENGTH, MATRIX_ENTRY, PIXEL, SIDE
 
 _TRACKS = {
     "lowres_wide.traj": ("lowres_wide", "lowres_wide_intrinsics"),
@@ -90,7 +92,9 @@ def _read_app(log: Path, folder: Path, scene_id: str, read: _FrameReader) -> Rec
     return Recording(
         path=log,
         scene_id=scene_id,
-        frames=tuple(read(read_json(logs[stem]), images[stem], size, str(logs[stem])) for stem in both),
+        frames=tuple(
+            read(read_json_object(logs[stem]), images[stem], size, str(logs[stem])) for stem in both
+        ),
         axes="opengl",
         up=(0.0, 1.0, 0.0),
         metric=True,
@@ -99,18 +103,21 @@ def _read_app(log: Path, folder: Path, scene_id: str, read: _FrameReader) -> Rec
 
 
 def _scanner_frame(content: Mapping[str, Any], image: Path, size: tuple[int, int], where: str) -> Frame:
-    pose = numbers(content, "cameraPoseARFrame", where, (4, 4))
-    matrix = numbers(content, "intrinsics", where, (3, 3))
+    pose = numbers(content, "cameraPoseARFrame", MATRIX_ENTRY, where, (4, 4))
+    matrix = numbers(content, "intrinsics", PIXEL, where, (3, 3))
     lens = Lens(size, (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]))
     return Frame(frame_name(image.name), image, pose, check_lens(lens, where))
 
 
 def _polycam_frame(content: Mapping[str, Any], image: Path, size: tuple[int, int], where: str) -> Frame:
     pose = np.eye(4)
-    pose[:3] = [[number(content, f"t_{row}{column}", where) for column in range(4)] for row in range(3)]
-    keys = ("fx", "fy", "cx", "cy", "width", "height")
-    fx, fy, cx, cy, width, height = (number(content, key, where) for key in keys)
-    lens = Lens((int(height), int(width)), (fx, fy), (cx, cy))
+    pose[:3] = [
+        [number(content, f"t_{row}{column}", MATRIX_ENTRY, where) for column in range(4)] for row in range(3)
+    ]
+    fx, fy = (number(content, key, FOCAL_LENGTH, where) for key in ("fx", "fy"))
+    cx, cy = (number(content, key, PIXEL, where) for key in ("cx", "cy"))
+    width, height = (int(number(content, key, SIDE, where)) for key in ("width", "height"))
+    lens = Lens((height, width), (fx, fy), (cx, cy))
     return Frame(frame_name(image.name), image, pose, check_lens(lens, where))
 
 

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
-from raytran.data.images import MAX_SIDE
 from raytran.data.scan import OpenScan
 from raytran.data.scannet.scan import Scan, SensScan
 from raytran.errors import DataError
+from raytran.limits import MAX_SIDE
 
 _DEPTH_STEPS = 1000.0
 """Steps of ScanNet's exported depth maps in a metre."""

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from raytran.data.images import MAX_SIDE
 from raytran.errors import ConfigError, DataError
+from raytran.limits import MAX_SIDE
 
 _SAME_PX = 0.25
 """Largest shift of a pixel for which an image is used without resampling, pixels."""

@@ -25,11 +25,12 @@ from raytran.capture.recording import (
     number,
     numbers,
     path_inside,
-    read_json,
     unposed_images,
 )
 from raytran.data.images import stored_size
+from raytran.data.text import read_json_object
 from raytran.errors import DataError
+from raytran.limits import ANGLE, DISTORTION, FOCAL_LENGTH, MATRIX_ENTRY, PIXEL, SCALE, SIDE
 
 NAMES = ("transforms.json", "transforms_train.json")
 
@@ -58,7 +59,7 @@ def read_nerfstudio(path: Path) -> Recording:
     listed = find_transforms(path)
     if listed is None:
         raise DataError(f"{path} holds no {NAMES[0]}: give the folder that ns-process-data wrote")
-    content = read_json(listed)
+    content = read_json_object(listed)
     entries = content.get("frames")
     if not isinstance(entries, list) or not entries or not all(isinstance(entry, dict) for entry in entries):
         raise DataError(f"{listed} lists no frames: export it again")
@@ -106,7 +107,7 @@ def frame_pose(entry: Mapping[str, Any], undo: NDArray[np.float64], where: str) 
     Raises:
         DataError: it has no matrix of 16 numbers.
     """
-    matrix = numbers(entry, "transform_matrix", where, (-1, 4))
+    matrix = numbers(entry, "transform_matrix", MATRIX_ENTRY, where, (-1, 4))
     if matrix.shape not in ((3, 4), (4, 4)):
         raise DataError(f"{where} has a transform_matrix of {matrix.size} numbers, not 16: export it again")
     pose = np.eye(4)
@@ -143,19 +144,20 @@ def frame_lens(
             f"{where} is a fisheye, and only pinhole cameras are rendered: write camera_model PINHOLE"
         )
     if size is None or ("w" in entry and "h" in entry):
-        size = int(number(entry, "h", where)), int(number(entry, "w", where))
+        size = int(number(entry, "h", SIDE, where)), int(number(entry, "w", SIDE, where))
     if min(size) < 1:
         raise DataError(f"{where} has a size of {size[1]}x{size[0]}: export it again")
     fx = _focal(entry, "fl_x", "camera_angle_x", size[1], where)
     fy = _focal(entry, "fl_y", "camera_angle_y", size[0], where) if _has_y(entry) else fx
-    center = number(entry, "cx", where, size[1] / 2), number(entry, "cy", where, size[0] / 2)
+    cx = number(entry, "cx", PIXEL, where, size[1] / 2)
+    center = cx, number(entry, "cy", PIXEL, where, size[0] / 2)
     if model in _PINHOLES or not distorted:
         return check_lens(Lens(size, (fx, fy), center), where)
-    k1, k2, k3, k4 = (number(entry, key, where, 0.0) for key in ("k1", "k2", "k3", "k4"))
+    k1, k2, k3, k4 = (number(entry, key, DISTORTION, where, 0.0) for key in ("k1", "k2", "k3", "k4"))
     if is_fisheye:
         return check_lens(Lens(size, (fx, fy), center, "OPENCV_FISHEYE", (k1, k2, k3, k4)), where)
-    tangential = number(entry, "p1", where, 0.0), number(entry, "p2", where, 0.0)
-    return opencv_lens(size, (fx, fy), center, (k1, k2, k3, k4), tangential, where)
+    p1, p2 = (number(entry, key, DISTORTION, where, 0.0) for key in ("p1", "p2"))
+    return opencv_lens(size, (fx, fy), center, (k1, k2, k3, k4), (p1, p2), where)
 
 
 def _has_y(entry: Mapping[str, Any]) -> bool:
@@ -164,8 +166,8 @@ def _has_y(entry: Mapping[str, Any]) -> bool:
 
 def _focal(entry: Mapping[str, Any], key: str, angle_key: str, side: int, where: str) -> float:
     if key in entry or angle_key not in entry:
-        return number(entry, key, where)
-    angle = number(entry, angle_key, where)
+        return number(entry, key, FOCAL_LENGTH, where)
+    angle = number(entry, angle_key, ANGLE, where)
     if not 0 < angle < math.pi:
         raise DataError(f"{where} has {angle_key} = {angle:g}, not between 0 and pi: export it again")
     return side / (2 * math.tan(angle / 2))
@@ -179,9 +181,9 @@ def undo_applied(content: Mapping[str, Any], listed: Path) -> NDArray[np.float64
     """
     applied = np.eye(4)
     if "applied_transform" in content:
-        matrix = numbers(content, "applied_transform", str(listed), (-1, 4))
+        matrix = numbers(content, "applied_transform", MATRIX_ENTRY, str(listed), (-1, 4))
         applied[:3] = matrix[:3] if len(matrix) in (3, 4) else np.nan
-    applied[:3] *= number(content, "applied_scale", str(listed), 1.0)
+    applied[:3] *= number(content, "applied_scale", SCALE, str(listed), 1.0)
     if not np.isfinite(applied).all() or abs(np.linalg.det(applied)) < 1e-12:
         raise DataError(f"applied_transform in {listed} cannot be undone: remove it or export it again")
     return np.asarray(np.linalg.inv(applied)[:3], dtype=np.float64)

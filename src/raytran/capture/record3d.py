@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 
 from raytran.capture.lens import Lens, check_lens
-from raytran.capture.recording import Frame, Recording, frame_name, images_in, number, numbers, read_json
+from raytran.capture.recording import Frame, Recording, frame_name, images_in, number, numbers
 from raytran.capture.trajectory import rotations
+from raytran.data.text import read_json_object
 from raytran.errors import DataError
+from raytran.limits import MATRIX_ENTRY, PIXEL, SIDE
 
 _NAMES = ("metadata.json", "metadata")
 _IMAGE_FOLDERS = ("rgb", "EXR_RGBD/rgb", "rgbd")
@@ -39,9 +41,9 @@ def read_record3d(path: Path) -> Recording:
     listed = find_metadata(path)
     if listed is None:
         raise DataError(f"{path} holds no metadata.json with rgb/ or rgbd/ beside it: export it as EXR + JPG")
-    content = read_json(listed)
+    content = read_json_object(listed)
     where = str(listed)
-    table = numbers(content, "poses", where, (-1, 7))
+    table = numbers(content, "poses", MATRIX_ENTRY, where, (-1, 7))
     folder = next(path / name for name in _IMAGE_FOLDERS if (path / name).is_dir())
     images = images_in(folder)
     if len(images) != len(table):
@@ -62,11 +64,11 @@ def read_record3d(path: Path) -> Recording:
 
 
 def _lenses(content: dict[str, Any], count: int, where: str) -> list[Lens]:
-    size = int(number(content, "h", where)), int(number(content, "w", where))
+    size = int(number(content, "h", SIDE, where)), int(number(content, "w", SIDE, where))
     if content.get("perFrameIntrinsicCoeffs"):
-        table = numbers(content, "perFrameIntrinsicCoeffs", where, (count, 4))
+        table = numbers(content, "perFrameIntrinsicCoeffs", PIXEL, where, (count, 4))
     else:
         # K is written column by column.
-        matrix = numbers(content, "K", where, (3, 3)).T
+        matrix = numbers(content, "K", PIXEL, where, (3, 3)).T
         table = np.tile(matrix[[0, 1, 0, 1], [0, 1, 2, 2]], (count, 1))
     return [check_lens(Lens(size, (fx, fy), (cx, cy)), where) for fx, fy, cx, cy in table.tolist()]

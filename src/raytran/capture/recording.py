@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording: frames with poses and lenses as a reader of some format returns them, and the scan they make.
 
-The helpers at the end, for names, image folders and JSON files, trust nothing that a file says.
+What stands at the end, for names, image folders and JSON objects, trusts nothing that a file says.
 """
 
 from __future__ import annotations
 
-import json
-import math
 import os
 from abc import ABC, abstractmethod
 from collections import Counter
@@ -25,6 +23,7 @@ from raytran.data.images import decode_image, stored_size
 from raytran.data.scan import LOST, NO_IMAGE, NO_POSE, OpenScan, numbers_first
 from raytran.data.scannet.text import are_rigid
 from raytran.errors import DataError
+from raytran.limits import Quantity, as_number, as_numbers
 
 Axes = Literal["opencv", "opengl"]
 """Axes of a camera: x right, y down, z forward; or x right, y up, z backward."""
@@ -35,7 +34,6 @@ UNREADABLE = "image cannot be read"
 IMAGE_ENDINGS = (".jpg", ".jpeg", ".png")
 
 _SAME_ASPECT = 0.01
-_MAX_JSON_BYTES = 64 * 2**20
 
 
 @dataclass(frozen=True)
@@ -305,58 +303,41 @@ def path_inside(folder: Path, name: str, listed_in: Path) -> Path:
     return Path(path)
 
 
-def read_json(path: Path) -> dict[str, Any]:
-    """Return the object that a JSON file holds.
-
-    Raises:
-        DataError: the file cannot be read, is larger than 64 MB, or holds no JSON object.
-    """
-    try:
-        if path.stat().st_size > _MAX_JSON_BYTES:
-            raise DataError(f"{path} is larger than 64 MB, as no list of frames is: check the path")
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise DataError(f"cannot read {path} ({error.strerror}): check the path") from error
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{path} is no valid JSON ({error}): export it again") from error
-    if not isinstance(content, dict):
-        raise DataError(f"{path} holds a {type(content).__name__}, not a JSON object: export it again")
-    return content
-
-
-def number(content: Mapping[str, Any], key: str, where: str, default: float | None = None) -> float:
-    """Return the finite number at a key of a JSON object.
+def number(
+    content: Mapping[str, Any], key: str, quantity: Quantity, where: str, default: float | None = None
+) -> float:
+    """Return the number at a key of a JSON object, within the bounds of what it measures.
 
     Args:
         content: the object.
         key: name of the value.
+        quantity: what it measures.
         where: name of the object in messages.
         default: value if the key is missing; None: it must be there.
 
     Raises:
-        DataError: it is missing or no finite number.
+        DataError: it is missing, no number, or out of bounds.
     """
-    value = content.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        state = f"has {key} = {str(value)[:50]!r}" if key in content else f"has no {key}"
-        raise DataError(f"{where} {state} where a number is needed: export it again")
-    return float(value)
+    if key not in content and default is None:
+        raise DataError(f"{where} has no {key} where a number is needed: export it again")
+    return as_number(content.get(key, default), quantity, f"{key} in {where}")
 
 
-def numbers(content: Mapping[str, Any], key: str, where: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return the array at a key of a JSON object; it may hold numbers that are not finite.
+def numbers(
+    content: Mapping[str, Any], key: str, quantity: Quantity, where: str, shape: tuple[int, ...]
+) -> NDArray[np.float64]:
+    """Return the array at a key of a JSON object; NaN where one is out of bounds, as of a lost pose.
 
     Args:
         content: the object.
         key: name of the value.
+        quantity: what each number measures.
         where: name of the object in messages.
         shape: of the array; a flat list of as many numbers will do.
 
     Raises:
         DataError: it is missing or of another size.
     """
-    try:
-        return np.array(content[key], dtype=np.float64).reshape(shape)
-    except (KeyError, TypeError, ValueError) as error:
-        size = "x".join(map(str, shape))
-        raise DataError(f"{where} has no {key} of {size} numbers: export it again") from error
+    if key not in content:
+        raise DataError(f"{where} has no {key} where numbers are needed: export it again")
+    return as_numbers(content[key], shape, quantity, f"{key} in {where}", lost=True)

@@ -17,10 +17,12 @@ from torch import Tensor
 from raytran.capture.lens import Lens, check_lens
 from raytran.capture.nerfstudio import frame_lens, frame_pose, undo_applied
 from raytran.capture.orientation import OPENGL
-from raytran.capture.recording import numbers, read_json
+from raytran.capture.recording import numbers
 from raytran.data.scannet.text import are_rigid
+from raytran.data.text import read_json_object
 from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
+from raytran.limits import MATRIX_ENTRY
 
 MAX_CAMERAS = 10_000
 """A list of more is taken for a mistake."""
@@ -63,7 +65,7 @@ def read_render_cameras(path: Path) -> RenderCameras:
         DataError: the file is missing, damaged, or lists no cameras; or an entry is no valid camera.
     """
     path = Path(path)
-    content = read_json(path)
+    content = read_json_object(path)
     if "views" not in content and "frames" not in content:
         raise DataError(f"{path} has neither views nor frames: write cameras as docs/novel-view.md shows")
     key = "views" if "views" in content else "frames"
@@ -80,7 +82,7 @@ def read_render_cameras(path: Path) -> RenderCameras:
     if key == "views":
         lenses = [_lens(entry, name) for entry, name in zip(entries, where, strict=True)]
         poses = [
-            numbers(entry, "world_from_camera", name, (4, 4))
+            numbers(entry, "world_from_camera", MATRIX_ENTRY, name, (4, 4))
             for entry, name in zip(entries, where, strict=True)
         ]
     else:

@@ -18,6 +18,7 @@ from raytran.capture.lens import Lens, check_lens, opencv_lens
 from raytran.capture.recording import Frame, Recording, frame_name, images_in, path_inside
 from raytran.data.images import stored_size
 from raytran.data.scan import NO_POSE
+from raytran.data.text import read_table, read_text
 from raytran.errors import DataError
 
 TRACK_NAMES = (
@@ -35,8 +36,6 @@ _SAME_TIME = 0.005
 
 _MAX_GAP = 0.25
 """Seconds between two poses over which a pose is interpolated."""
-
-_MAX_BYTES = 64 * 2**20
 
 _IMAGE_FOLDERS = ("rgb", "images", "color", "image", "frames", ".")
 _IMAGE_LIST = "rgb.txt"
@@ -59,24 +58,6 @@ class Track:
 
     def __len__(self) -> int:
         return len(self.world_from_camera)
-
-
-def read_table(path: Path) -> NDArray[np.float64]:
-    """Return the numbers in a text file, one row a line, split at blanks or commas; ``#`` starts comments.
-
-    Raises:
-        DataError: it cannot be read, or its lines are no rows of as many numbers each.
-    """
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise DataError(f"{path} is larger than 64 MB, as no pose track is: check the path")
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-        rows = [line.partition("#")[0].replace(",", " ").split() for line in lines]
-        return np.array([[float(word) for word in row] for row in rows if row], dtype=np.float64)
-    except OSError as error:
-        raise DataError(f"cannot read {path} ({error.strerror}): check the path") from error
-    except ValueError as error:
-        raise DataError(f"{path} does not hold as many numbers in each line ({error}): mend it") from error
 
 
 def read_track(path: Path) -> Track:
@@ -274,10 +255,10 @@ def _timed_images(folder: Path, track: Track) -> list[tuple[Path, float]]:
 def _listed_images(folder: Path, listed: Path) -> list[tuple[Path, float]]:
     """Return images and times, seconds, of a file of `timestamp file` lines."""
     try:
-        lines = listed.read_text(encoding="utf-8").splitlines()
+        lines = read_text(listed).splitlines()
         rows = [line.split(maxsplit=1) for line in lines if line.strip() and not line.startswith("#")]
         images = [path_inside(folder, name.strip(), listed) for _, name in rows]
         times = np.array([float(time) for time, _ in rows])
-    except (OSError, ValueError) as error:
+    except ValueError as error:
         raise DataError(f"{listed} does not hold `timestamp file` lines ({error}): mend it") from error
     return list(zip(images, in_seconds(times).tolist(), strict=True))

@@ -20,9 +20,10 @@ from raytran.capture.trajectory import (
     read_camera,
     read_track,
 )
-from raytran.data.images import MAX_SIDE, resize
+from raytran.data.images import resize
 from raytran.data.scan import NO_POSE
 from raytran.errors import ConfigError, DataError
+from raytran.limits import MAX_SIDE
 
 VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
 

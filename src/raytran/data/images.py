@@ -16,14 +16,12 @@ from PIL import Image
 from torch import Tensor
 
 from raytran.errors import DataError
+from raytran.limits import MAX_SIDE
 
 _log = logging.getLogger(__name__)
 
 MIN_VIEWS = 2
 """Fewest different frames from which a scene is reconstructed."""
-
-MAX_SIDE = 8192
-"""Most pixels along a side of an image that is decoded: a few bytes can claim any number."""
 
 _UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
 """What Pillow raises for files that are truncated, damaged, absurdly large or no images."""

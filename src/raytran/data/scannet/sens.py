@@ -15,8 +15,9 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from raytran.data.images import MAX_SIDE, decode_image, resize
+from raytran.data.images import decode_image, resize
 from raytran.errors import DataError
+from raytran.limits import MAX_SIDE
 
 _log = logging.getLogger(__name__)
 
