@@ -118,13 +118,15 @@ def test_corrected_keyframes_come_first(walk):
 
 def test_what_is_wrong_is_named(walk):
     folder = write_scanner(walk, walk.folder.parent / "log")
-    (folder / "frame_00004.json").write_text('{"intrinsics": [1]}')
+    for n in range(12):
+        (folder / f"frame_{n:05d}.json").write_text('{"intrinsics": [1]}')
     with pytest.raises(
-        DataError, match=r"frame_00004\.json has no cameraPoseARFrame where numbers are needed"
+        DataError, match=r"frame_00000\.json has no cameraPoseARFrame where numbers are needed"
     ):
         read_arkit(folder)
     scenes = write_arkitscenes(walk, walk.folder.parent / "scenes") / "41254925_frames"
-    next((scenes / "lowres_wide_intrinsics").iterdir()).write_text("64 48")
+    for path in (scenes / "lowres_wide_intrinsics").iterdir():
+        path.write_text("64 48")
     with pytest.raises(DataError, match="does not hold `width height fx fy cx cy`"):
         read_arkit(scenes)
     (scenes / "lowres_wide.traj").write_text("1 2 3\n")

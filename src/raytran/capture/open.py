@@ -13,7 +13,7 @@ from raytran.capture.colmap import find_model, read_colmap
 from raytran.capture.nerfstudio import find_transforms, read_nerfstudio
 from raytran.capture.orientation import WorldSettings, to_our_world
 from raytran.capture.record3d import find_metadata, read_record3d
-from raytran.capture.recording import RecordedScan, Recording, open_recording
+from raytran.capture.recording import Intrinsics, RecordedScan, Recording, open_recording
 from raytran.capture.trajectory import is_tum, read_tum
 from raytran.capture.video import find_video, open_video, read_video
 from raytran.data.scan import OpenScan
@@ -29,7 +29,7 @@ class _Format:
     """How to recognise a format, to read its poses, and to open its images."""
 
     fits: Callable[[Path], bool]
-    read: Callable[[Path], Recording]
+    read: Callable[[Path, Intrinsics | None], Recording]
     open: Callable[[Recording], RecordedScan] = open_recording
 
 
@@ -46,7 +46,13 @@ _FORMATS = {
 FORMATS: tuple[str, ...] = ("auto", "scannet", *_FORMATS)
 
 
-def open_scene(path: Path, *, format: str = "auto", settings: WorldSettings | None = None) -> OpenScan:
+def open_scene(
+    path: Path,
+    *,
+    format: str = "auto",
+    settings: WorldSettings | None = None,
+    intrinsics: Intrinsics | None = None,
+) -> OpenScan:
     """Open the frames of a scene in any format, in OpenCV axes, metres and with +z up.
 
     Use it in a ``with`` statement, or close it. What was recognised, and what is doubtful, is logged.
@@ -55,6 +61,7 @@ def open_scene(path: Path, *, format: str = "auto", settings: WorldSettings | No
         path: a folder or file.
         format: one of ``FORMATS``.
         settings: what is known of its world; None: everything is left to the format and the images.
+        intrinsics: fx, fy, cx, cy of the stored images, pixels, in place of what files say or do not say.
 
     Raises:
         ConfigError: the format is unknown, or a package is missing: PyAV for videos, pycolmap for lenses that
@@ -68,7 +75,7 @@ def open_scene(path: Path, *, format: str = "auto", settings: WorldSettings | No
     name = _recognised(path) if format == "auto" else format
     if name == "scannet":
         return to_our_world(open_scan(path), settings, aligned=True)
-    recording = _FORMATS[name].read(path)
+    recording = _FORMATS[name].read(path, intrinsics)
     scan = _FORMATS[name].open(recording)
     try:
         return to_our_world(scan, settings, axes=recording.axes, up=recording.up, metric=recording.metric)

@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
+from raytran.data.scan import LOST
 from raytran.data.scannet.scan import load_views, open_scan, read_scan, read_sens
 from raytran.errors import DataError
 
@@ -40,8 +41,14 @@ def test_frames_without_image_or_valid_pose_are_dropped_with_the_reason(write_sc
     (folder / "pose" / "6.txt").unlink()
     scan = read_scan(folder)
     assert scan.frame_id == ("0",)
-    rigid = "pose is not finite or no rigid motion"
-    assert scan.dropped == {"1": rigid, "2": rigid, "3": rigid, "4": rigid, "5": "no image", "6": "no pose"}
+    assert scan.dropped == {
+        "1": LOST,
+        "2": LOST,
+        "3": "no camera-to-world matrix of numbers",
+        "4": "pose is all zeros",
+        "5": "no image",
+        "6": "no pose",
+    }
 
 
 def test_header_gives_the_axis_alignment(write_scan) -> None:
@@ -86,7 +93,7 @@ def test_all_poses_invalid(write_scan) -> None:
     for path in (folder / "pose").iterdir():
         np.savetxt(path, np.full((4, 4), -np.inf))
     with pytest.raises(
-        DataError, match=r"none of the 4 frames in .*scene0000_00 has an image and a valid pose"
+        DataError, match=r"none of the 4 frames of .*scene0000_00 has an image and a valid pose"
     ):
         read_scan(folder)
 
@@ -156,8 +163,7 @@ def test_a_recording_drops_what_an_export_drops(write_sens) -> None:
     (path.parent / "scene0000_00.txt").write_text("axisAlignment = 1 0 0 5 0 1 0 0 0 0 1 0 0 0 0 1\n")
     with read_sens(path) as scan:
         assert (scan.scene_id, scan.frame_id) == ("scene0000_00", ("1", "2", "4"))
-        rigid = "pose is not finite or no rigid motion"
-        assert scan.dropped == {"0": rigid, "3": rigid}
+        assert scan.dropped == {"0": LOST, "3": LOST}
         assert scan.world_from_camera[:, 0, 3].tolist() == pytest.approx([0.01, 0.02, 0.04])
         assert scan.image_size == (32, 48)
         assert scan.axis_alignment[0, 3] == 5
@@ -180,7 +186,7 @@ def test_a_cut_recording_gives_the_frames_before_and_says_so(write_sens, caplog)
 def test_recordings_without_a_usable_frame(write_sens) -> None:
     path = write_sens(frames=3, lost=[0, 1, 2])
     with pytest.raises(
-        DataError, match=r"none of the 3 frames in .*scene0000_00\.sens has an image and a valid"
+        DataError, match=r"none of the 3 frames of .*scene0000_00\.sens has an image and a valid"
     ):
         read_sens(path)
     path = write_sens("scene0001_00", frames=0)

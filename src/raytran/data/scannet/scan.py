@@ -12,16 +12,16 @@ import torch
 from numpy.typing import NDArray
 
 from raytran.data.images import decode_image, stored_size
-from raytran.data.scan import LOST, NO_IMAGE, NO_POSE, OpenScan, even_views, numbers_first
+from raytran.data.scan import NO_IMAGE, NO_MATRIX, NO_POSE, OpenScan, even_views, none_usable, numbers_first
 from raytran.data.scannet.layout import Listing, find_layout, recognise
 from raytran.data.scannet.sens import SensFile
 from raytran.data.scannet.text import (
-    are_rigid,
     axis_alignment,
     check_intrinsics,
+    pose_faults,
     read_header,
     read_intrinsics,
-    read_matrix,
+    read_pose,
 )
 from raytran.errors import DataError
 from raytran.structs import Views
@@ -122,16 +122,16 @@ def read_scan(folder: Path, *, header: Path | None = None, any_size: bool = Fals
     complete = sorted(images.keys() & pose_files.keys(), key=numbers_first)
     dropped = {name: NO_IMAGE for name in pose_files.keys() - images.keys()}
     dropped |= {name: NO_POSE for name in images.keys() - pose_files.keys()}
-    matrices = [read_matrix(pose_files[name]) for name in complete]
+    matrices = [read_pose(pose_files[name]) for name in complete]
     poses = np.array([_NO_MATRIX if matrix is None else matrix for matrix in matrices]).reshape(-1, 4, 4)
-    rigid = are_rigid(poses)
-    dropped |= {name: LOST for name, is_rigid in zip(complete, rigid, strict=True) if not is_rigid}
-    names = [name for name, is_rigid in zip(complete, rigid, strict=True) if is_rigid]
+    faults = [
+        NO_MATRIX if matrix is None else fault
+        for matrix, fault in zip(matrices, pose_faults(poses), strict=True)
+    ]
+    dropped |= {name: fault for name, fault in zip(complete, faults, strict=True) if fault is not None}
+    names = [name for name in complete if name not in dropped]
     if not names:
-        raise DataError(
-            f"none of the {len(dropped)} frames in {folder} has an image and a valid pose: check that each "
-            "image has a text file of its name with a finite 4x4 camera-to-world matrix"
-        )
+        raise none_usable(folder, dropped)
     header = header or folder / f"{folder.name}.txt"
     facts = read_header(header)
     image_size = stored_size([images[name] for name in names])
@@ -141,7 +141,7 @@ def read_scan(folder: Path, *, header: Path | None = None, any_size: bool = Fals
         folder=folder,
         frame_id=tuple(names),
         image_path=tuple(images[name] for name in names),
-        world_from_camera=torch.from_numpy(poses[rigid]),
+        world_from_camera=torch.from_numpy(poses[[fault is None for fault in faults]]),
         intrinsics=check_intrinsics(
             read_intrinsics(intrinsics_file),
             intrinsics_file,
@@ -173,18 +173,17 @@ def read_sens(
     try:
         scene_id = scene_id or path.stem
         poses = file.world_from_camera
-        rigid, has_image = are_rigid(poses), file.num_color_bytes > 0
-        usable = np.flatnonzero(rigid & has_image).tolist()
-        dropped = {
-            str(i): LOST if has_image[i] else NO_IMAGE for i in np.flatnonzero(~(rigid & has_image)).tolist()
-        }
+        reasons = [
+            fault if has_image else NO_IMAGE
+            for fault, has_image in zip(pose_faults(poses), file.num_color_bytes > 0, strict=True)
+        ]
+        usable = [i for i, reason in enumerate(reasons) if reason is None]
+        dropped = {str(i): reason for i, reason in enumerate(reasons) if reason is not None}
         if file.damage is not None:
             _log.warning("%s", file.damage)
             dropped[str(len(file))] = CUT
         if not usable:
-            raise DataError(
-                f"none of the {len(file)} frames in {path} has an image and a valid pose: download it again"
-            )
+            raise none_usable(path, dropped)
         header = header or path.with_name(f"{scene_id}.txt")
         facts = read_header(header)
         return SensScan(

@@ -10,7 +10,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from raytran.data.scan import EMPTY, LEFT_HANDED, LOST, SCALED, SKEWED
+from raytran.data.text import read_table
 from raytran.errors import DataError
+from raytran.limits import POSITION
 
 INFO_FILES = ("_info.txt", "info.txt")
 """Names of the C++ exporter's file of facts."""
@@ -23,19 +26,71 @@ _MAX_OFFSET = 0.15
 
 
 def read_matrix(path: Path) -> NDArray[np.float64] | None:
-    """Return the matrix of 16 or 9 numbers in a text file as 4×4, or None if the file does not hold one."""
+    """Return the matrix of 16, 12 or 9 numbers in a text file as 4×4, or None if it does not hold one."""
     try:
-        return _matrix(_start_of(path).decode("ascii"))
-    except (OSError, ValueError):
+        return _matrix(read_table(path, max_bytes=_MAX_BYTES).ravel())
+    except (DataError, ValueError):
         return None
+
+
+def read_pose(path: Path) -> NDArray[np.float64] | None:
+    """Return the pose of 16 or 12 numbers in a text file as 4×4, or None if the file does not hold one.
+
+    What programs write is read: numbers parted by commas or semicolons, a byte order mark, UTF-16.
+    """
+    try:
+        values = read_table(path, max_bytes=_MAX_BYTES).ravel()
+    except DataError:
+        return None
+    return _matrix(values) if values.size in (12, 16) else None
 
 
 def are_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which of ``(n, 4, 4)`` matrices are finite and hold a rotation in their upper left, ``(n,)``."""
-    finite = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
+    finite = _are_within(poses)
     rotation = np.where(finite[:, None, None], poses[:, :3, :3], 0.0)
     error = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
     return finite & (error < 0.01) & (np.linalg.det(rotation) > 0)
+
+
+def pose_faults(poses: NDArray[np.float64]) -> list[str | None]:
+    """Return for each of ``(n, 4, 4)`` matrices why it is no pose; None if it is one.
+
+    The reasons are those of ``raytran.data.scan``.
+    """
+    finite = _are_within(poses)
+    rotation = np.where(finite[:, None, None], poses[:, :3, :3], 0.0)
+    gram = rotation @ rotation.swapaxes(1, 2)
+    square = np.trace(gram, axis1=1, axis2=2) / 3
+    is_uniform = np.abs(gram - square[:, None, None] * np.eye(3)).max(axis=(1, 2)) < 0.01 * square
+    determinant = np.linalg.det(rotation)
+    return [
+        None if fits else _pose_fault(*facts)
+        for fits, *facts in zip(are_rigid(poses), finite, square, is_uniform, determinant, strict=True)
+    ]
+
+
+def _are_within(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which of ``(n, 4, 4)`` matrices are finite and of positions that a room can have, ``(n,)``."""
+    return np.asarray((np.abs(poses) <= POSITION.high).all(axis=(1, 2)))  # not-a-number is not
+
+
+def _pose_fault(finite: bool, square: float, is_uniform: bool, determinant: float) -> str:
+    """Return why a matrix is no pose.
+
+    Args:
+        finite: whether its numbers are.
+        square: mean of the squared lengths of its axes.
+        is_uniform: whether the axes are at right angles and of one length.
+        determinant: of the upper left 3×3.
+    """
+    if not finite:
+        return LOST
+    if square < 1e-12:
+        return EMPTY
+    if not is_uniform:
+        return SKEWED
+    return LEFT_HANDED if determinant < 0 else f"{SCALED} {square**0.5:.2g}"
 
 
 def read_header(path: Path) -> dict[str, str]:
@@ -71,7 +126,8 @@ def read_intrinsics(path: Path) -> NDArray[np.float64]:
     """
     if path.name in INFO_FILES:
         try:
-            matrix = _matrix(read_header(path).get("m_calibrationColorIntrinsic", ""))
+            text = read_header(path).get("m_calibrationColorIntrinsic", "")
+            matrix = _matrix(np.array([float(word) for word in text.split()]))
         except ValueError:
             matrix = None
     else:
@@ -133,13 +189,16 @@ def _start_of(path: Path) -> bytes:
         return file.read(_MAX_BYTES)
 
 
-def _matrix(text: str) -> NDArray[np.float64]:
-    values = np.array([float(word) for word in text.split()])
-    if values.size != 9:
-        return values.reshape(4, 4)
+def _matrix(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return 16 numbers, 12 (3×4) or 9 (3×3) as a 4×4 matrix; others raise ValueError."""
     matrix = np.eye(4)
-    matrix[:3, :3] = values.reshape(3, 3)
-    return matrix
+    if values.size == 9:
+        matrix[:3, :3] = values.reshape(3, 3)
+        return matrix
+    if values.size == 12:
+        matrix[:3] = values.reshape(3, 4)
+        return matrix
+    return values.reshape(4, 4)
 
 
 def _distance_from_centre(matrix: NDArray[np.float64], width: int, height: int) -> float:
