@@ -98,7 +98,7 @@ def test_what_is_not_there_or_unknown(walk, tmp_path):
         open_scene(walk.folder, format="kitti")
     with pytest.raises(DataError, match=r"there is no scene .*nowhere: check the path"):
         open_scene(tmp_path / "nowhere")
-    with pytest.raises(DataError, match="holds the folder images, so no frames"):
+    with pytest.raises(DataError, match="has images without poses: let COLMAP or a phone's ARKit find them"):
         open_scene(walk.folder)
     (tmp_path / "notes.doc").write_text("")
     with pytest.raises(DataError, match=r"notes\.doc is in none of the formats scannet, "):

@@ -121,7 +121,7 @@ def test_intrinsics_for_a_slightly_other_size_that_the_header_states(write_scan)
 
 def test_intrinsics_that_are_no_matrix(write_scan) -> None:
     folder = write_scan()
-    (folder / "intrinsic" / "intrinsic_color.txt").write_text("577 577 320 240")
+    (folder / "intrinsic" / "intrinsic_color.txt").write_text("577 577 320")
     with pytest.raises(DataError, match="does not hold a 4x4 or 3x3 camera matrix"):
         read_scan(folder)
 

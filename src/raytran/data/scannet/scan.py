@@ -13,11 +13,13 @@ from numpy.typing import NDArray
 
 from raytran.data.images import decode_image, stored_size
 from raytran.data.scan import NO_IMAGE, NO_MATRIX, NO_POSE, OpenScan, even_views, none_usable, numbers_first
-from raytran.data.scannet.layout import Listing, find_layout, recognise
+from raytran.data.scannet.layout import Layout, Listing, find_layout, recognise
 from raytran.data.scannet.sens import SensFile
 from raytran.data.scannet.text import (
     axis_alignment,
+    camera_matrix,
     check_intrinsics,
+    header_intrinsics,
     pose_faults,
     read_header,
     read_intrinsics,
@@ -30,6 +32,10 @@ _log = logging.getLogger(__name__)
 
 CUT = "the file ends here"
 """Reason why the frames after the end of a damaged recording are dropped."""
+
+_MAX_APART, _OTHER_SIZE = 0.01, 0.2
+"""Relative differences between two files of intrinsics: from the first on it is said, from the second on they
+are for images of other sizes."""
 
 _NO_MATRIX = np.full((4, 4), np.nan)
 
@@ -101,7 +107,13 @@ class SensScan(OpenScan):
         self.file.close()
 
 
-def read_scan(folder: Path, *, header: Path | None = None, any_size: bool = False) -> Scan:
+def read_scan(
+    folder: Path,
+    *,
+    header: Path | None = None,
+    any_size: bool = False,
+    intrinsics: tuple[float, float, float, float] | None = None,
+) -> Scan:
     """Read a scan's cameras and the list of its frames; images are read later.
 
     A frame without an image or with a pose that is no rigid motion (ScanNet writes ``-inf`` where tracking
@@ -111,6 +123,7 @@ def read_scan(folder: Path, *, header: Path | None = None, any_size: bool = Fals
         folder: a scan in one of the exported forms of ``layout.FORMS``.
         header: its ``<scan>.txt``; if None the one in the folder, which may be missing.
         any_size: accept intrinsics for another image size, as the data doctor does to name the fault.
+        intrinsics: fx, fy, cx, cy of the stored images, in place of those in files.
 
     Raises:
         DataError: the folder or a part of it is missing, no pose is valid, or the intrinsics are for another
@@ -135,7 +148,7 @@ def read_scan(folder: Path, *, header: Path | None = None, any_size: bool = Fals
     header = header or folder / f"{folder.name}.txt"
     facts = read_header(header)
     image_size = stored_size([images[name] for name in names])
-    intrinsics_file = layout.intrinsics()
+    matrix, intrinsics_file = _intrinsics(layout, header, facts, intrinsics)
     return Scan(
         scene_id=folder.name,
         folder=folder,
@@ -143,7 +156,7 @@ def read_scan(folder: Path, *, header: Path | None = None, any_size: bool = Fals
         image_path=tuple(images[name] for name in names),
         world_from_camera=torch.from_numpy(poses[[fault is None for fault in faults]]),
         intrinsics=check_intrinsics(
-            read_intrinsics(intrinsics_file),
+            matrix,
             intrinsics_file,
             image_size=image_size,
             header=facts,
@@ -155,8 +168,51 @@ def read_scan(folder: Path, *, header: Path | None = None, any_size: bool = Fals
     )
 
 
+def _intrinsics(
+    layout: Layout,
+    header: Path,
+    facts: dict[str, str],
+    typed: tuple[float, float, float, float] | None,
+) -> tuple[NDArray[np.float64], Path]:
+    """Return the 4×4 camera matrix of a folder, and where it was read.
+
+    What the user typed comes first, then the file of intrinsics, then ``<scan>.txt``.
+
+    Raises:
+        DataError: there is none, or it is damaged.
+    """
+    if typed is not None:
+        return camera_matrix(*typed), Path("intrinsics=" + ",".join(f"{value:g}" for value in typed))
+    path = layout.intrinsics()
+    stated = header_intrinsics(facts)
+    if not path.is_file() and stated is not None:
+        _log.info("%s has no file of intrinsics: those of %s are taken", layout.scan, header.name)
+        return stated, header
+    depth = layout.depth_intrinsics()
+    if not path.is_file() and depth is not None:
+        raise DataError(
+            f"{depth} is of the depth camera, and {path.name} of the colour camera is missing: export it, or "
+            "give intrinsics=fx,fy,cx,cy"
+        )
+    matrix = read_intrinsics(path)
+    if stated is not None and np.isfinite(matrix).all():
+        apart = float((np.abs(matrix - stated) / np.abs(stated).clip(min=1.0))[:2].max())
+        # More is another size of the images, which is judged by the principal point.
+        if _MAX_APART < apart < _OTHER_SIZE:
+            _log.warning(
+                "%s and %s differ by %.1f %% in the intrinsics of the colour camera: the former are taken",
+                *(path, header.name, 100 * apart),
+            )
+    return matrix, path
+
+
 def read_sens(
-    path: Path, *, scene_id: str | None = None, header: Path | None = None, any_size: bool = False
+    path: Path,
+    *,
+    scene_id: str | None = None,
+    header: Path | None = None,
+    any_size: bool = False,
+    intrinsics: tuple[float, float, float, float] | None = None,
 ) -> SensScan:
     """Open a ``.sens`` recording; frames are dropped as in ``read_scan``.
 
@@ -165,6 +221,7 @@ def read_sens(
         scene_id: name of the scan; if None the file's without its ending.
         header: its ``<scan>.txt``; if None the one beside the file, which may be missing.
         any_size: see ``read_scan``.
+        intrinsics: fx, fy, cx, cy of the stored images, in place of the recording's.
 
     Raises:
         DataError: see ``SensFile``; no pose is valid, or the intrinsics are for another image size.
@@ -191,7 +248,11 @@ def read_sens(
             frame_id=tuple(map(str, usable)),
             world_from_camera=torch.from_numpy(poses[usable]),
             intrinsics=check_intrinsics(
-                file.color_intrinsics, path, image_size=file.color_size, header=facts, any_size=any_size
+                file.color_intrinsics if intrinsics is None else camera_matrix(*intrinsics),
+                path,
+                image_size=file.color_size,
+                header=facts,
+                any_size=any_size,
             ),
             image_size=file.color_size,
             axis_alignment=axis_alignment(facts, header),
@@ -205,23 +266,27 @@ def read_sens(
         raise
 
 
-def open_scan(path: Path) -> OpenScan:
+def open_scan(path: Path, intrinsics: tuple[float, float, float, float] | None = None) -> OpenScan:
     """Open a scan in whatever form: a folder of frames, a folder with a ``.sens`` recording, or that file.
+
+    Args:
+        path: the folder or file.
+        intrinsics: fx, fy, cx, cy of the stored images, in place of those in files.
 
     Raises:
         DataError: there is none, or see ``read_scan`` and ``read_sens``.
     """
     path = Path(path)
     if path.is_file():
-        return read_sens(path)
+        return read_sens(path, intrinsics=intrinsics)
     if path.is_dir():
         listing = Listing.of(path)
         recordings = sorted(name for name in listing.files if name.endswith(".sens"))
         if recordings and recognise(listing) is None:
             if len(recordings) > 1:
                 raise DataError(f"{path} holds {len(recordings)} recordings: give the path of one of them")
-            return read_sens(path / recordings[0])
-    return read_scan(path)
+            return read_sens(path / recordings[0], intrinsics=intrinsics)
+    return read_scan(path, intrinsics=intrinsics)
 
 
 def load_views(

@@ -119,7 +119,7 @@ def axis_alignment(header: dict[str, str], path: Path) -> Tensor:
 
 
 def read_intrinsics(path: Path) -> NDArray[np.float64]:
-    """Return the 4×4 camera matrix of a text file of 16 or 9 numbers, or of ``_info.txt``.
+    """Return the 4×4 camera matrix of a text file of 16 or 9 numbers or of fx fy cx cy, or of ``_info.txt``.
 
     Raises:
         DataError: the file is missing or holds no such matrix.
@@ -131,11 +131,33 @@ def read_intrinsics(path: Path) -> NDArray[np.float64]:
         except ValueError:
             matrix = None
     else:
-        matrix = read_matrix(path)
+        try:
+            values = read_table(path, max_bytes=_MAX_BYTES).ravel()
+            matrix = camera_matrix(*values.tolist()) if values.size == 4 else _matrix(values)
+        except (DataError, ValueError):
+            matrix = None
     if matrix is None:
         state = "does not hold a 4x4 or 3x3 camera matrix" if path.is_file() else "is missing"
-        raise DataError(f"{path} {state}: write fx, fy, cx, cy of the stored colour images there as 4x4")
+        raise DataError(
+            f"{path} {state}: write fx, fy, cx, cy of the stored colour images there as 4x4, or give "
+            "intrinsics=fx,fy,cx,cy"
+        )
     return matrix
+
+
+def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:
+    """Return the 4×4 camera matrix of intrinsics in pixels."""
+    return np.array([[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0], [0, 0, 0, 1]], dtype=np.float64)
+
+
+def header_intrinsics(header: dict[str, str]) -> NDArray[np.float64] | None:
+    """Return the 4×4 camera matrix of the colour camera that ``<scan>.txt`` states, or None."""
+    try:
+        fx, fy, cx, cy = (float(header[key]) for key in ("fx_color", "fy_color", "mx_color", "my_color"))
+    except (KeyError, ValueError):
+        return None
+    matrix = camera_matrix(fx, fy, cx, cy)
+    return matrix if np.isfinite(matrix).all() and min(fx, fy) > 0 else None
 
 
 def check_intrinsics(
