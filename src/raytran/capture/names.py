@@ -13,7 +13,7 @@ import os
 import posixpath
 import re
 import unicodedata
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -193,14 +193,16 @@ def locate(names: Sequence[str], root: Path) -> Located:
     # Two names for one image: whichever is wrong, none of them is certain, unless one is exact.
     unsure = frozenset(missing)
     exact = {place for i, place in enumerate(places) if i not in unsure}
-    meant = Counter(places[i] for i in missing if isinstance(places[i], Path))
+    spellings: defaultdict[Path | str, set[_Key]] = defaultdict(set)
+    for i in missing:
+        spellings[places[i]].add(tuple(map(_folded, _parts(names[i]))))
     respelled = {}
     for i in missing:
         place = places[i]
         if isinstance(place, Path) and search.is_there(place):
             if place in exact:
                 places[i] = search.exact(names[i])
-            elif meant[place] > 1 and not _is_one_name(names, places, place):
+            elif len(spellings[place]) > 1:
                 places[i] = UNCLEAR
             elif not _lacks_ending_only(names[i], place):
                 respelled[names[i]] = place
@@ -329,12 +331,6 @@ def _agree(given: _Key, folder: _Key) -> bool:
         return given[len(given) - len(folder) :] == folder
     ahead, end = folder[: len(folder) - len(given)], folder[len(folder) - len(given) :]
     return end == given and all(part in IMAGE_FOLDERS for part in ahead)
-
-
-def _is_one_name(names: Sequence[str], places: Sequence[Path | str], place: Path) -> bool:
-    """Whether all names of a place are one, listed several times."""
-    spelled = (name for name, other in zip(names, places, strict=True) if other == place)
-    return len({tuple(map(_folded, _parts(name))) for name in spelled}) == 1
 
 
 def _lacks_ending_only(name: str, place: Path) -> bool:

@@ -224,8 +224,6 @@ def _lacking(path: Path, listing: Listing) -> str | None:
         return "has Polycam's keyframes without cameras/ and images/ in it: export it as raw data"
     if {"database.db"} & listing.files or (len(models) == 1 and models != {"images"}):
         return "has parts of a COLMAP project but no model: wanted are cameras and images, .bin or .txt"
-    if "pose" in listing.folders and "color" not in listing.folders:
-        return "has poses in pose/ but no color/<n>.jpg beside it: export the colour images too"
     return None
 
 

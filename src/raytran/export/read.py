@@ -321,9 +321,9 @@ class _Row(NamedTuple):
 def read_alignments_csv(path: Path) -> CadAlignments:
     """Read the predictions for one scan, 12 columns a row; a header row and blank lines are skipped.
 
-    A 13th column is the score. Quaternions and categories are kept as given, but one sentence warns of quaternions not of length one and
-    of categories without eight digits: the official script takes them as they are, and the latter match
-    nothing.
+    A 13th column is the score. Quaternions and categories are kept as given, but one sentence warns of
+    quaternions not of length one and of categories without eight digits: the official script takes them as
+    they are, and the latter match nothing.
 
     Args:
         path: ``<id_scan>.csv``.

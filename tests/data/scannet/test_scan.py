@@ -275,3 +275,79 @@ def test_real_walk_is_resized_to_another_aspect(shared_dir) -> None:
     with Image.open(folder / "color" / f"{frame_id[0]}.jpg") as image:
         mean = np.asarray(image, dtype=float).mean(axis=(0, 1))
     np.testing.assert_allclose(views.images[0, 0].float().mean(dim=(1, 2)), mean, atol=1.0)
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda pose: "\ufeff" + "\n".join(" ".join(map(str, row)) for row in pose),
+        lambda pose: "\n".join(",".join(map(str, row)) for row in pose),
+        lambda pose: "\r\n".join("; ".join(map(str, row)) for row in pose),
+        lambda pose: "\n".join(" ".join(map(str, row)) for row in pose[:3]),
+        lambda pose: " ".join(map(str, pose.ravel())),
+        lambda pose: ", ".join(map(str, pose[:3].ravel())),
+        lambda pose: "# camera to world\n" + "\n".join("\t".join(map(str, row)) for row in pose),
+    ],
+    ids=["mark", "commas", "semicolons", "3x4", "one line", "12 in one line", "comment"],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_poses_as_other_programs_write_them(write_scan, write, encoding) -> None:
+    folder = write_scan()
+    expected = read_scan(folder).world_from_camera
+    for path in (folder / "pose").iterdir():
+        text = write(np.loadtxt(path))
+        path.write_text(text.lstrip("\ufeff") if encoding == "utf-16" else text, encoding=encoding)
+    assert torch.equal(read_scan(folder).world_from_camera, expected)
+
+
+def test_a_rotation_alone_is_no_pose(write_scan) -> None:
+    folder = write_scan(frames=(0, 1, 2))
+    np.savetxt(folder / "pose" / "1.txt", np.eye(3))
+    np.savetxt(folder / "pose" / "2.txt", np.eye(4) * [1, 1, -1, 1])
+    assert read_scan(folder).dropped == {
+        "1": "no camera-to-world matrix of numbers",
+        "2": "left-handed pose (determinant −1)",
+    }
+
+
+def test_all_poses_left_handed_or_scaled(write_scan) -> None:
+    folder = write_scan()
+    poses = {path: np.loadtxt(path) for path in (folder / "pose").iterdir()}
+    for spoil, said in (
+        (np.diag([1.0, 1, -1, 1]), r"4 left-handed pose \(determinant −1\).*: one axis is mirrored"),
+        (np.diag([0.5, 0.5, 0.5, 1]), "4 rotation scaled by 0.5.*: divide the upper left 3x3"),
+    ):
+        for path, pose in poses.items():
+            np.savetxt(path, spoil @ pose)
+        with pytest.raises(DataError, match=said):
+            read_scan(folder)
+
+
+def test_the_depth_cameras_intrinsics_are_not_taken(write_scan) -> None:
+    folder = write_scan()
+    (folder / "intrinsic" / "intrinsic_color.txt").rename(folder / "intrinsic" / "intrinsic_depth.txt")
+    with pytest.raises(
+        DataError, match=r"intrinsic_depth\.txt is of the depth camera, and intrinsic_color\.txt"
+    ):
+        read_scan(folder)
+    assert read_scan(folder, intrinsics=(40, 41, 24, 16)).intrinsics.reshape(-1, 3, 3)[0, 1, 1] == 41
+
+
+def test_the_header_fills_in_intrinsics_and_does_not_replace_them(write_scan, caplog) -> None:
+    folder = write_scan()
+    path = folder / "intrinsic" / "intrinsic_color.txt"
+    header = "colorWidth = 48\ncolorHeight = 32\nfx_color = {}\nfy_color = 40\nmx_color = 24\nmy_color = 16\n"
+    (folder / "scene0000_00.txt").write_text(header.format(40.7))
+    assert read_scan(folder).intrinsics.reshape(-1, 3, 3)[0, 0, 0] == 40
+    assert "differ by 1.7 % in the intrinsics of the colour camera: the former are taken" in caplog.text
+    path.unlink()
+    assert read_scan(folder).intrinsics.reshape(-1, 3, 3)[0, 0, 0] == 40.7
+    (folder / "scene0000_00.txt").write_text(header.format("wide"))
+    with pytest.raises(DataError, match=r"intrinsic_color\.txt is missing: .*or give intrinsics=fx,fy,cx,cy"):
+        read_scan(folder)
+
+
+def test_intrinsics_as_four_numbers(write_scan) -> None:
+    folder = write_scan()
+    (folder / "intrinsic" / "intrinsic_color.txt").write_text("40, 41, 24, 16\n", encoding="utf-8-sig")
+    assert read_scan(folder).intrinsics.reshape(-1, 3, 3)[0].tolist() == [[40, 0, 24], [0, 41, 16], [0, 0, 1]]
