@@ -58,15 +58,16 @@ def test_the_apps_first_form_has_no_numbers(walk, folder, heading):
     check_frames(open_recording(read_stray(folder)), walk, turn=Y_UP)
 
 
-def test_smaller_images_scale_the_camera_of_the_video(walk, folder):
+@pytest.mark.parametrize("size", [(96, 72), (960, 720)])
+def test_smaller_images_scale_the_camera_of_the_video(walk, folder, size):
     (folder / "camera_matrix.csv").write_text("1440,0,960\n0,1440,720\n0,0,1\n")
     for path in (folder / "rgb").iterdir():
         with Image.open(path) as image:
             image.load()
-        image.resize((96, 72)).save(path)
+        image.resize(size).save(path)
     scan = open_recording(read_stray(folder))
-    assert scan.lens[0].size == (72, 96)
-    assert scan.lens[0].focal == pytest.approx((72.0, 72.0))
+    assert scan.lens[0].size == size[::-1]
+    assert scan.lens[0].focal == pytest.approx((0.75 * size[0], size[1]))
 
 
 def test_what_is_missing_is_named(walk, folder):

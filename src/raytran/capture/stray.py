@@ -25,12 +25,13 @@ from raytran.capture.recording import (
     open_recording,
     typed_lens,
 )
-from raytran.capture.trajectory import read_camera, read_rows, rotations
+from raytran.capture.trajectory import read_rows, rotations
 from raytran.capture.video import VideoFile, open_video
 from raytran.data.images import stored_size
 from raytran.data.scan import NO_IMAGE, NO_POSE
-from raytran.data.text import parted, read_text
+from raytran.data.text import parted, read_table, read_text
 from raytran.errors import DataError
+from raytran.limits import PIXEL, as_number
 
 _ODOMETRY = "odometry.csv"
 _CAMERA = "camera_matrix.csv"
@@ -144,16 +145,20 @@ def _camera(path: Path, size: tuple[int, int]) -> Lens:
     """Return the lens in ``camera_matrix.csv``, for images of ``size`` or of the app's videos."""
     if not path.is_file():
         raise DataError(f"{path} is missing: copy the whole recording, or give intrinsics=fx,fy,cx,cy")
-    try:
-        return read_camera(path, size)
-    except DataError:
-        return read_camera(path, _VIDEO_SIZE)
+    values = read_table(path)
+    if values.shape != (3, 3):
+        raise DataError(f"{path} does not hold a 3x3 camera matrix: copy it again")
+    fx, fy, cx, cy = values[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    return _lens([fx, fy, cx, cy], size, str(path))
 
 
 def _lens(values: list[float], size: tuple[int, int], where: str) -> Lens:
     """Return the lens of a row, for images of ``size`` or of the app's videos."""
-    fx, fy, cx, cy = values
-    try:
-        return check_lens(Lens(size, (fx, fy), (cx, cy)), where)
-    except DataError:
-        return check_lens(Lens(_VIDEO_SIZE, (fx, fy), (cx, cy)), where)
+    fx, fy, cx, cy = (as_number(value, PIXEL, f"the camera in {where}") for value in values)
+
+    def off(size: tuple[int, int]) -> float:
+        return max(abs(cx / size[1] - 0.5), abs(cy / size[0] - 0.5))
+
+    # The principal point is near the middle of the images that it is for.
+    fitting = min((size, _VIDEO_SIZE), key=off)
+    return check_lens(Lens(fitting, (fx, fy), (cx, cy)), where)
