@@ -113,6 +113,12 @@ def test_corrected_keyframes_come_first(walk):
     assert find_log(folder) == folder / "keyframes" / "cameras"
     for part in ("cameras", "images"):
         (folder / "keyframes" / f"corrected_{part}").mkdir()
+    # They are empty in a capture that was not optimised.
+    assert find_log(folder) == folder / "keyframes" / "cameras"
+    for part in ("cameras", "images"):
+        shutil.copytree(
+            folder / "keyframes" / part, folder / "keyframes" / f"corrected_{part}", dirs_exist_ok=True
+        )
     assert find_log(folder) == folder / "keyframes" / "corrected_cameras"
 
 

@@ -370,3 +370,13 @@ def test_typed_intrinsics_come_first(walk):
     scan = open_recording(read_colmap(walk.folder, walk.camera))
     assert scan.lens[3].focal == (50.0, 51.0)
     check_frames(scan, walk)
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_names_in_the_letters_of_windows(walk, binary):
+    (walk.folder / "images" / "3.png").rename(walk.folder / "images" / "küche.png")
+    names = tuple("k#che.png" if name == "3.png" else name for name in walk.names)
+    write_colmap(replace(walk, names=names), walk.folder / "sparse" / "0", binary=binary)
+    for path in (walk.folder / "sparse" / "0").iterdir():
+        path.write_bytes(path.read_bytes().replace(b"k#che", "küche".encode("cp1252")))
+    check_frames(open_recording(read_colmap(walk.folder)), walk)

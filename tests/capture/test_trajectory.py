@@ -354,3 +354,17 @@ def test_typed_intrinsics_come_first(walk, folder):
     assert scan.lens[0].focal == (50.0, 51.0)
     with pytest.raises(DataError, match=r"intrinsics=5,5,310,250 has its principal point at"):
         read_tum(folder, (5, 5, 310, 250))
+
+
+def test_images_without_a_time_and_damaged_lines_are_left_out(walk, tmp_path, caplog):
+    folder = tmp_path / "slow"
+    write_tum(walk, folder, 0.5 + np.arange(12))
+    (folder / "rgb" / "cover.png").write_bytes(b"")
+    scan = open_recording(read_tum(folder))
+    assert scan.dropped == {"cover": "no time in its name"}
+    check_frames(scan, walk)
+    rows = [f"{n + 0.5} rgb/{n + 0.5:.6f}.png" for n in range(12)]
+    rows[4] = "lost"
+    (folder / "rgb.txt").write_text("\n".join(["time file", *rows]))
+    check_frames(open_recording(read_tum(folder)), walk, [n for n in range(12) if n != 4])
+    assert "1 of 12 lines are damaged and left out" in caplog.text

@@ -156,3 +156,8 @@ def test_rows_of_no_form(tmp_path, rows, said):
     with pytest.raises(DataError, match=said) as caught:
         read_roca_csv(write(tmp_path, *rows))
     assert len(str(caught.value)) - len(str(tmp_path)) < 260
+
+
+def test_semicolons_of_spreadsheets(tmp_path):
+    alignments = read_alignments_csv(write(tmp_path, ROW.replace(",", ";"), ROW.replace(",", ";")))
+    assert alignments.scale.tolist() == [[0.5, 0.6, 0.7]] * 2

@@ -30,7 +30,7 @@ from raytran.capture.recording import (
     numbers,
     typed_lens,
 )
-from raytran.capture.trajectory import Track, poses_at, read_rows
+from raytran.capture.trajectory import NO_TIME, Track, poses_at, read_rows
 from raytran.data.images import stored_size
 from raytran.data.scan import NO_IMAGE, NO_MATRIX, NO_POSE, numbers_first
 from raytran.data.text import read_json_object, read_table
@@ -63,9 +63,6 @@ _LensReader = Callable[[Mapping[str, Any], Path, tuple[int, int]], Lens]
 _MAX_APART = 0.06
 """Seconds between an image and its intrinsics, which like the poses may come ten times a second."""
 
-NO_TIME = "no time in its name"
-"""Reason why a frame is dropped."""
-
 
 def find_log(path: Path) -> Path | None:
     """Return the track, or the folder of JSON files, of a recording; None if ``path`` holds none."""
@@ -75,9 +72,12 @@ def find_log(path: Path) -> Path | None:
         for name in _TRACKS:
             if (folder / name).is_file():
                 return folder / name
-    for cameras, images in _POLYCAM:
-        if (path / cameras).is_dir() and (path / images).is_dir():
-            return path / cameras
+    pairs = [(path / cameras, path / images) for cameras, images in _POLYCAM]
+    pairs = [(cameras, images) for cameras, images in pairs if cameras.is_dir() and images.is_dir()]
+    # A capture that the app did not optimise has empty folders for what it would have corrected.
+    filled = [cameras for cameras, images in pairs if _visible(cameras, "*.json") and images_in(images)]
+    if pairs:
+        return filled[0] if filled else pairs[0][0]
     return path if _visible(path, "frame_*.json") else None
 
 

@@ -19,6 +19,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import torch
@@ -71,6 +72,7 @@ _LARGEST_SIZE = 1 << 31
 _IMAGE_BYTES = 64
 """Bytes of an image in ``images.bin``, at least."""
 
+_OF_WINDOWS = "cp1252"
 _WIDE_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _POINT_BYTES = 24
 """Bytes of an observed point in ``images.bin``."""
@@ -346,6 +348,8 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
     try:
         with path.open("rb") as file:
             encoding = "utf-16" if file.read(2) in _WIDE_MARKS else "utf-8-sig"
+            file.seek(0)
+            encoding = encoding if encoding == "utf-16" or _is_utf8(file) else _OF_WINDOWS
         with path.open(encoding=encoding) as text:
             row = 1
             while line := text.readline(_MAX_LINE):
@@ -357,6 +361,25 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
                 row += 1
     except (OSError, UnicodeError) as error:
         raise DataError(f"cannot read {path} ({str(error)[:80]}): export the model again") from error
+
+
+def _is_utf8(file: BinaryIO) -> bool:
+    decoder = codecs.getincrementaldecoder("utf-8")()
+    try:
+        while chunk := file.read(_MAX_LINE):
+            decoder.decode(chunk)
+        decoder.decode(b"", final=True)
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
+def _decoded(name: bytes) -> str:
+    """Return the name of an image, in UTF-8 or as Windows spells it."""
+    try:
+        return name.decode("utf-8")
+    except UnicodeDecodeError:
+        return name.decode(_OF_WINDOWS, errors="replace")
 
 
 def _cameras_binary(path: Path) -> dict[int, Lens | DataError]:
@@ -390,7 +413,7 @@ def _images_binary(path: Path) -> list[_Image]:
             at = end + 9 + num_points * _POINT_BYTES
             if at > len(data):
                 raise struct.error("too few points")
-            name = data[start:end].decode("utf-8", errors="replace")
+            name = _decoded(data[start:end])
             images.append(_Image(name, camera, tuple(pose[:4]), tuple(pose[4:])))
     return images
 

@@ -58,11 +58,14 @@ _IMAGE_LIST = "rgb.txt"
 _TIME_IN_NAME = re.compile(r"(\d+(?:\.\d+)?)$")
 _NUMBER_IN_NAME = re.compile(r"(\d+)\D*$")
 
+NO_TIME = "no time in its name"
+"""Reason why a frame is dropped."""
+
 _FIRST_MOMENT = 1e8
 """Whole numbers in names from here on are seconds since 1970 (this is 1973); smaller ones count frames."""
 
 _MAX_BAD_ROWS = 0.1
-"""Share of a track's lines that may be damaged."""
+"""Share of the lines of a track, or of a list of images, that may be damaged."""
 
 
 @dataclass(frozen=True)
@@ -384,19 +387,22 @@ def _posed_images(folder: Path, track: Track) -> tuple[_Posed, dict[str, str]]:
         return [], {}
     if track.times is None:
         return _in_order(images, track.world_from_camera, f"{folder} ({track.path.name})"), {}
-    matches = [_TIME_IN_NAME.search(image.stem) for image in images]
-    if not all(matches):
-        without_time = next(image for image, match in zip(images, matches, strict=True) if match is None)
+    found = [(image, _TIME_IN_NAME.search(image.stem)) for image in images]
+    timed = [(image, match[1]) for image, match in found if match]
+    if not timed:
         raise DataError(
-            f"{without_time} has no time in its name: name images by the track's timestamps, or write "
+            f"{images[0]} has no time in its name: name images by the track's timestamps, or write "
             f"`timestamp file` lines in {listed}"
         )
-    words = [match[1] for match in matches if match]
+    # Files of other names lie among the frames by chance, as a cover picture does.
+    dropped = dict.fromkeys(unlike([frame_name(image.name) for image, match in found if not match]), NO_TIME)
+    images = [image for image, _ in timed]
+    words = [word for _, word in timed]
     numbers = np.array([float(word) for word in words])
     counts_frames = not any("." in word for word in words) and (numbers < _FIRST_MOMENT).all()
     if counts_frames and not _are_moments(numbers, track.times):
-        return _numbered(images, numbers, track), {}
-    return list(zip(images, poses_at(track, in_seconds(numbers)), strict=True)), {}
+        return _numbered(images, numbers, track), dropped
+    return list(zip(images, poses_at(track, in_seconds(numbers)), strict=True)), dropped
 
 
 def _in_order(images: list[Path], poses: NDArray[np.float64], what: str) -> _Posed:
@@ -448,15 +454,19 @@ def _listed_images(folder: Path, listed: Path) -> tuple[list[Path], NDArray[np.f
     Raises:
         DataError: it does not hold such lines, or all images are elsewhere.
     """
-    try:
-        lines = read_text(listed).splitlines()
-        rows = [line.split(maxsplit=1) for line in lines if line.strip() and not line.startswith("#")]
-        times = np.array([float(time) for time, _ in rows])
-    except ValueError as error:
-        raise DataError(
-            f"{listed} does not hold `timestamp file` lines ({str(error)[:80]}): mend it"
-        ) from error
-    names = [name.strip() for _, name in rows]
+    lines = [line for line in read_text(listed).splitlines() if line.strip() and not line.startswith("#")]
+    if lines and not _as_floats(lines[0].split()[:1]):
+        lines = lines[1:]  # a heading
+    words = [row for line in lines if len(row := line.split(maxsplit=1)) == 2]
+    rows = [(time, name.strip()) for time, name in words if _as_floats([time])]
+    if len(lines) - len(rows) > _MAX_BAD_ROWS * len(lines):
+        raise DataError(f"{listed} does not hold `timestamp file` lines: mend it")
+    if len(rows) < len(lines):
+        _log.warning(
+            "%s: %d of %d lines are damaged and left out", listed, len(lines) - len(rows), len(lines)
+        )
+    times = np.array([float(time) for time, _ in rows])
+    names = [name for _, name in rows]
     located = locate(names, folder)
     located.report(listed, folder)
     places = [(i, place) for i, place in enumerate(located.places) if isinstance(place, Path)]

@@ -370,7 +370,9 @@ def _read_rows(path: Path, forms: Sequence[tuple[str, ...]]) -> list[_Row]:
     not_unit: list[int] = []
     columns: tuple[str, ...] | None = None
     try:
-        table = list(csv.reader(read_text(path).splitlines()))
+        lines = read_text(path).splitlines()
+        separator = ";" if lines and "," not in lines[0] else ","  # spreadsheets write semicolons
+        table = list(csv.reader(lines, delimiter=separator))
     except csv.Error as error:
         raise DataError(f"cannot read the alignments {path} ({error}): check the path") from error
     for line, cells in enumerate(table, start=1):
