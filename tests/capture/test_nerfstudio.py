@@ -30,7 +30,7 @@ def test_poses_intrinsics_and_images_are_those_that_were_written(walk):
     assert scan.scene_id == "walk"
     assert scan.frame_id == tuple(str(n) for n in range(12))
     np.testing.assert_allclose(scan.world_from_camera.numpy() @ OPENGL, walk.poses, atol=1e-12)
-    assert scan.intrinsics.numpy()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist() == list(walk.camera)
+    assert scan.intrinsics[0].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist() == list(walk.camera)
     assert scan.read_color(7)[0, 0].tolist() == [140] * 3
 
 
@@ -52,9 +52,10 @@ def test_intrinsics_of_single_frames_come_before_the_shared_ones(walk):
     for n, frame in enumerate(frames):
         frame["fl_x"] = 50.0 + 0.1 * n
     scan = opened(walk, frames=frames)
-    # Frames are listed backwards: the first has the longest focal length.
-    assert [round(lens.focal[0], 3) for lens in scan.lens[:2]] == [51.1, 51.0]
-    assert scan.pinhole.focal[1] / 51.0 == pytest.approx(scan.pinhole.focal[0] / 50.55)
+    # Frames are listed backwards: the first has the longest focal length. Each keeps its own.
+    assert scan.intrinsics[:2, 0, 0].tolist() == pytest.approx([51.1, 51.0])
+    assert (scan.intrinsics[:, 1, 1] == 51).all()
+    assert scan.color_bytes(0) is not None
 
 
 def test_an_angle_of_view_will_do_and_names_without_ending(walk):
@@ -64,13 +65,81 @@ def test_an_angle_of_view_will_do_and_names_without_ending(walk):
     angle = 2 * math.atan(64 / 2 / 50)
     (walk.folder / "transforms.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
     scan = open_recording(read_nerfstudio(walk.folder))
-    assert scan.intrinsics.numpy()[[0, 1, 0, 1], [0, 1, 2, 2]] == pytest.approx([50, 50, 32, 24])
+    assert scan.intrinsics[0].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]] == pytest.approx([50, 50, 32, 24])
     assert len(scan) == 12
 
 
-def test_distortion_is_read_unless_the_model_has_none(walk):
-    assert opened(walk, k1=0.2).color_bytes(0) is None
-    assert opened(walk, k1=0.2, camera_model="PINHOLE").color_bytes(0) is not None
+@pytest.mark.parametrize(
+    "facts",
+    [
+        {"k1": 0.2, "k2": -0.01, "p1": 0.003},
+        {"distortion_params": [0.2, -0.01, 0.0, 0.0, 0.003, 0.0]},
+        {"distortion_params": [0.2, -0.01, 0, 0, 0.003, 0], "k1": 0.9},
+        {"k1": 0.2, "k2": -0.01, "p1": 0.003, "camera_model": "PINHOLE"},
+        {"k1": 0.2, "k2": -0.01, "p1": 0.003, "camera_model": "SIMPLE_PINHOLE"},
+    ],
+)
+def test_distortion_is_read_as_nerfstudio_does(walk, facts):
+    """One list in the order of nerfstudio's parser, or one by one; whatever the camera model is called."""
+    scan = opened(walk, **facts)
+    # OpenCV's order: k1, k2, p1, p2, k3, …
+    assert {lens.distortion[:5] for lens in scan.lens} == {(0.2, -0.01, 0.003, 0.0, 0.0)}
+    assert scan.color_bytes(0) is None
+
+
+def test_distortion_of_single_frames_as_a_list(walk):
+    frames = transforms(walk)["frames"]
+    frames[0]["distortion_params"] = [-0.1, 0, 0, 0, 0, 0]
+    frames[1]["distortion_params"] = [-0.1]
+    frames[2]["distortion_params"] = [0.1, 0, 0.02, 0]
+    frames[3]["distortion_params"] = [0.1] * 12
+    frames[4]["distortion_params"] = "none"
+    scan = opened(walk, frames=frames)
+    assert [lens.is_pinhole for lens in scan.lens] == [True] * 7 + [False] * 2
+    assert scan.dropped == dict.fromkeys(("7", "8", "9"), "intrinsics that cannot be read")
+
+
+def test_a_lens_that_is_none_costs_its_own_frame_alone(walk):
+    frames = transforms(walk)["frames"]
+    frames[0]["fl_x"] = -50
+    frames[1] |= {"k1": -44.8, "k2": 1017}
+    frames[2] |= {"cx": 6000}
+    frames[3] |= {"w": 48, "h": 64, "cx": 25, "cy": 31}
+    frames[4] |= {"w": 64, "h": 64}
+    frames[5]["fl_x"] = "wide"
+    frames[6]["camera_model"] = "EQUIRECTANGULAR"
+    scan = opened(walk, frames=frames)
+    assert scan.frame_id == ("0", "1", "2", "3", "4")
+    assert scan.dropped == {
+        "11": "focal lengths and centre not positive and finite",
+        "10": "distortion that moves the corners out of the image",
+        "9": "principal point far outside of the image",
+        "8": "image turned by 90° against its intrinsics",
+        "7": "image of another shape than its intrinsics are for",
+        "6": "intrinsics that cannot be read",
+        "5": "intrinsics that cannot be read",
+    }
+
+
+def test_a_principal_point_that_wanders_is_followed(walk):
+    frames = transforms(walk)["frames"]
+    for n, frame in enumerate(frames):
+        frame |= {"cx": 31 + 4 * n, "cy": 25 - 3 * n}
+    scan = opened(walk, frames=frames)
+    assert scan.dropped == {}
+    assert sorted(scan.intrinsics[:, 0, 2].tolist()) == [31 + 4 * n for n in range(12)]
+
+
+def test_intrinsics_of_another_size_are_refused_and_those_of_crops_are_not(walk):
+    with pytest.raises(DataError, match=r"principal point at \(16.0, 12.0\), the middle of 32x24 and far"):
+        opened(walk, cx=16, cy=12)
+    with pytest.raises(DataError, match="the middle of 48x64, turned by 90° and far from that of 64x48"):
+        opened(walk, cx=24, cy=32)
+    assert opened(walk, cx=0, cy=25).dropped == {}
+    # Of a few frames it is taken for what the camera measured.
+    frames = transforms(walk)["frames"]
+    frames[3] |= {"cx": 16, "cy": 12}
+    assert opened(walk, frames=frames).dropped == {}
 
 
 @pytest.mark.parametrize("changes", [{"camera_model": "OPENCV_FISHEYE"}, {"is_fisheye": True}])
@@ -104,10 +173,13 @@ def test_a_pose_that_is_none_is_dropped(walk):
         ({"frames": [{"file_path": "images/0.png"}]}, "frame 0 of .* has no transform_matrix"),
         ({"fl_x": "wide"}, "has fl_x = 'wide' where a number is needed"),
         ({"fl_x": float("inf")}, "where a number is needed"),
-        ({"camera_model": "OPENCV_FISHEYE", "k1": -3}, "the distortion of frame 0 .* folds the image"),
+        ({"camera_model": "OPENCV_FISHEYE", "k1": -3}, "the distortion of frame 11 .* folds the image"),
         ({"camera_model": "EQUIRECTANGULAR"}, "EQUIRECTANGULAR, which is not read: undistort"),
         ({"w": 100_000, "h": 100_000}, "100000x100000"),
-        ({"w": 48, "h": 64, "cx": 25, "cy": 31}, "is 64x48 and its intrinsics .* for 48x64, turned by 90°"),
+        ({"w": 48, "h": 64, "cx": 25, "cy": 31}, "is 64x48 and its intrinsics .* for 48x64, turned by 90°:"),
+        ({"w": 64, "h": 64}, "is 64x48 and its intrinsics .* for 64x64: give the images"),
+        ({"w": 0, "h": 64}, "has a size of 0x64: export it again"),
+        ({"k1": -44.8, "k2": 1017}, "the distortion of frame 11 .* moves the corners out of the image"),
         ({"applied_transform": [[0, 0, 0, 0]] * 3}, "applied_transform .* cannot be undone"),
         ({"applied_transform": "yes"}, "no applied_transform of"),
     ],

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from raytran.capture.recording import (
     Frame,
     Recording,
     frame_name,
+    lens_or_fault,
     number,
     numbers,
     path_inside,
@@ -73,7 +75,7 @@ def read_nerfstudio(path: Path) -> Recording:
     for i, (entry, image) in enumerate(zip(entries, images, strict=True)):
         where = f"frame {i} of {listed}"
         name = frame_name(image.relative_to(root).as_posix())
-        lens = frame_lens(entry, size, where)
+        lens = lens_or_fault(partial(frame_lens, entry, size, where))
         frames.append(Frame(name, image, frame_pose(entry, undo, where), lens))
     return Recording(
         path=listed,
@@ -149,13 +151,27 @@ def frame_lens(
     fx = _focal(entry, "fl_x", "camera_angle_x", size[1], where)
     fy = _focal(entry, "fl_y", "camera_angle_y", size[0], where) if _has_y(entry) else fx
     center = number(entry, "cx", where, size[1] / 2), number(entry, "cy", where, size[0] / 2)
-    if model in _PINHOLES or not distorted:
+    if not distorted:
         return check_lens(Lens(size, (fx, fy), center), where)
-    k1, k2, k3, k4 = (number(entry, key, where, 0.0) for key in ("k1", "k2", "k3", "k4"))
+    # Whatever the camera model: nerfstudio, too, removes the distortion of a PINHOLE that has one.
+    k1, k2, k3, k4, p1, p2 = _distortion(entry, where)
     if is_fisheye:
         return check_lens(Lens(size, (fx, fy), center, "OPENCV_FISHEYE", (k1, k2, k3, k4)), where)
-    tangential = number(entry, "p1", where, 0.0), number(entry, "p2", where, 0.0)
-    return opencv_lens(size, (fx, fy), center, (k1, k2, k3, k4), tangential, where)
+    return opencv_lens(size, (fx, fy), center, (k1, k2, k3, k4), (p1, p2), where)
+
+
+def _distortion(entry: Mapping[str, Any], where: str) -> list[float]:
+    """Return k1, k2, k3, k4, p1, p2: ``distortion_params`` in this order, or one by one; 0 if not given."""
+    names = ("k1", "k2", "k3", "k4", "p1", "p2")
+    if entry.get("distortion_params") is None:
+        return [number(entry, name, where, 0.0) for name in names]
+    params = numbers(entry, "distortion_params", where, (-1,)).tolist()
+    # Of fewer than six nobody knows whether the third is k3, as here, or p1, as in OpenCV.
+    if len(params) > len(names) or (len(params) < len(names) and any(params[2:])):
+        raise DataError(
+            f"{where} has {len(params)} distortion_params, not k1, k2, k3, k4, p1, p2: export it again"
+        )
+    return params + [0.0] * (len(names) - len(params))
 
 
 def _has_y(entry: Mapping[str, Any]) -> bool:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from functools import cache
 from io import BytesIO
@@ -24,6 +25,14 @@ MIN_VIEWS = 2
 
 MAX_SIDE = 8192
 """Most pixels along a side of an image that is decoded: a few bytes can claim any number."""
+
+FILL = (124, 116, 104)
+"""Red, green and blue around a picture of another shape: ImageNet's mean, which encoders take for zero."""
+
+_SAME_ASPECT = 0.01
+"""Relative difference up to which two images have the same aspect: one row or column of a hundred."""
+
+_ROUNDING = 1e-6
 
 _UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
 """What Pillow raises for files that are truncated, damaged, absurdly large or no images."""
@@ -72,6 +81,74 @@ def decode_image(
 def resize(pixels: NDArray[np.uint8], image_size: tuple[int, int]) -> NDArray[np.uint8]:
     """Resize ``(H, W, 3)`` pixels to ``image_size`` (H, W) as the images of files are."""
     return np.array(Image.fromarray(pixels).resize(image_size[::-1], Image.Resampling.BILINEAR))
+
+
+def has_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether images of two sizes ``(H, W)`` have one aspect, so that one may be the other resized."""
+    return abs((size[1] / size[0]) / (other[1] / other[0]) - 1) <= _SAME_ASPECT
+
+
+def is_turned(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether images of one size ``(H, W)`` have the shape of another's turned by 90°, and not its own."""
+    return has_shape(size, other[::-1]) and not has_shape(size, other)
+
+
+def box_within(size: tuple[int, int], canvas: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Return where images of one size lie when they are brought to another, (left, top, right, bottom).
+
+    Images of the same aspect fill it all. Others keep their aspect: they are scaled until they just fit and
+    put into the middle, to a pixel.
+
+    Args:
+        size: ``(H, W)`` of the images.
+        canvas: ``(H, W)`` to which they are brought.
+    """
+    height, width = canvas
+    if has_shape(size, canvas):
+        return 0, 0, width, height
+    scale = min(height / size[0], width / size[1])
+    h, w = max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
+    left, top = (width - w) // 2, (height - h) // 2
+    return left, top, left + w, top + h
+
+
+def fill_up(
+    pixels: NDArray[np.uint8],
+    box: Sequence[float],
+    canvas: tuple[int, int],
+    image_size: tuple[int, int] | None = None,
+) -> NDArray[np.uint8]:
+    """Return an image of a larger size that shows pixels in a box and ``FILL`` around them.
+
+    Args:
+        pixels: ``(h, w, 3)``.
+        box: left, top, right and bottom of where they come to lie on the canvas.
+        canvas: ``(H, W)``.
+        image_size: ``(H', W')`` to which the canvas is resized; None: as it is.
+
+    Returns:
+        ``(H', W', 3)``. Where the box ends within a pixel, that pixel is filled up.
+    """
+    height, width = image_size or canvas
+    scale_x, scale_y = width / canvas[1], height / canvas[0]
+    left, top, right, bottom = box[0] * scale_x, box[1] * scale_y, box[2] * scale_x, box[3] * scale_y
+    # Whole pixels, and the part of the picture that they show: its place stays exact.
+    x0, y0 = math.ceil(left - _ROUNDING), math.ceil(top - _ROUNDING)
+    x1, y1 = math.floor(right + _ROUNDING), math.floor(bottom + _ROUNDING)
+    image = np.empty((height, width, 3), dtype=np.uint8)
+    image[:] = FILL
+    if x1 > x0 and y1 > y0:
+        rows, columns = pixels.shape[:2]
+        across, down = columns / (right - left), rows / (bottom - top)
+        part = (
+            max((x0 - left) * across, 0.0),
+            max((y0 - top) * down, 0.0),
+            min((x1 - left) * across, columns),
+            min((y1 - top) * down, rows),
+        )
+        shown = Image.fromarray(pixels).resize((x1 - x0, y1 - y0), Image.Resampling.BILINEAR, box=part)
+        image[y0:y1, x0:x1] = np.array(shown)
+    return image
 
 
 def read_frames(

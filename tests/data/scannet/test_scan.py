@@ -220,7 +220,7 @@ def test_real_scan_with_lost_frames(shared_dir) -> None:
     assert sorted(scan.dropped) == ["255", "605"]
     assert scan.frame_id == tuple(str(n) for n in range(0, 600, 10))
     assert scan.image_size == (480, 640)
-    assert scan.intrinsics[0].tolist() == [577.870605, 0.0, 319.5]
+    assert scan.intrinsics[0, 0].tolist() == [577.870605, 0.0, 319.5]
     # The scan is turned by 4.3° against its walls; poses stay as they are.
     angle = torch.atan2(scan.axis_alignment[1, 0], scan.axis_alignment[0, 0]).rad2deg()
     assert angle.item() == pytest.approx(-4.3, abs=0.05)
