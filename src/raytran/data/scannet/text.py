@@ -13,6 +13,7 @@ from torch import Tensor
 from raytran.data.images import is_turned
 from raytran.errors import DataError
 from raytran.geometry.camera import FARTHEST_CENTER, center_offset, other_image_size
+from raytran.geometry.checks import rigid_motions
 
 INFO_FILES = ("_info.txt", "info.txt")
 """Names of the C++ exporter's file of facts."""
@@ -31,10 +32,8 @@ def read_matrix(path: Path) -> NDArray[np.float64] | None:
 
 def are_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which of ``(n, 4, 4)`` matrices are finite and hold a rotation in their upper left, ``(n,)``."""
-    finite = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
-    rotation = np.where(finite[:, None, None], poses[:, :3, :3], 0.0)
-    error = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
-    return finite & (error < 0.01) & (np.linalg.det(rotation) > 0)
+    is_rigid: NDArray[np.bool_] = rigid_motions(torch.from_numpy(poses)).numpy()
+    return is_rigid
 
 
 def read_header(path: Path) -> dict[str, str]:
