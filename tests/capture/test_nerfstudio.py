@@ -4,16 +4,21 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import struct
 import zlib
 
 import numpy as np
 import pytest
+import torch
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from raytran.capture.nerfstudio import read_nerfstudio
 from raytran.capture.recording import open_recording
+from raytran.data.images import FILL
+from raytran.data.scan import report_dropped, scan_views
 from raytran.errors import DataError
 
 from .forms import OPENGL, transforms, write_transforms
@@ -224,3 +229,111 @@ def test_a_list_that_is_too_long_to_be_one_is_refused_unread(walk):
         file.truncate(65 * 2**20)
     with pytest.raises(DataError, match="is larger than 64 MB, as no list of frames is: check the path"):
         read_nerfstudio(path)
+
+
+def rotated(walk, numbers, quarters=1):
+    """Make some images upright ones; return the entries of all frames, with the lenses of these."""
+    frames = transforms(walk)["frames"]
+    for n in numbers:
+        path = walk.folder / "images" / f"{n}.png"
+        with Image.open(path) as image:
+            turned = Image.new("RGB", image.size[::-1], image.getpixel((0, 0)))
+        turned.save(path)
+        frames[11 - n] |= {"w": 48, "h": 64, "fl_x": 51.0, "fl_y": 50.0, "cx": 25.0, "cy": 31.0}
+    return frames
+
+
+def test_portrait_frames_among_landscape_ones_keep_their_lens(walk):
+    scan = opened(walk, frames=rotated(walk, [3, 7]))
+    assert (len(scan), scan.dropped, scan.image_size) == (12, {}, (48, 64))
+    # 48x64 becomes 36x48, in the middle of 64x48.
+    assert scan.picture.tolist() == [
+        [14.0, 0, 50, 48] if n in (3, 7) else [0.0, 0, 64, 48] for n in range(12)
+    ]
+    expected = [[51 * 0.75, 0, 25 * 0.75 + 14], [0, 50 * 0.75, 31 * 0.75], [0, 0, 1]]
+    assert scan.intrinsics[3].tolist() == expected
+    assert scan.intrinsics[4].tolist() == [[50, 0, 31], [0, 51, 25], [0, 0, 1]]
+    image = scan.read_color(7)
+    assert (image[:, 14:50] == 140).all()
+    assert (image[:, [0, 13, 50, 63]] == np.array(FILL)).all()
+    assert scan.color_bytes(7) is None
+    assert scan.color_bytes(4) is not None
+    assert scan.read_color(7, (24, 32))[:, 7:25].ravel().tolist() == [140] * (24 * 18 * 3)
+
+
+def test_the_views_know_their_pictures_if_one_is_filled_up(walk):
+    scan = opened(walk, frames=rotated(walk, [3, 7]))
+    views, used = scan_views(scan, [2, 3, 4], image_size=(24, 64))
+    assert used == [2, 3, 4]
+    assert views.picture[0].tolist() == [[0, 0, 64, 24], [14, 0, 50, 24], [0, 0, 64, 24]]
+    assert views.intrinsics[0, 1, 1].tolist() == [0, 50 * 0.75 / 2, 31 * 0.75 / 2]
+    assert scan_views(scan, [2, 4], image_size=(24, 64))[0].picture is None
+
+
+def test_a_point_is_seen_at_the_same_place_of_a_portrait_frame(walk):
+    """A bright square where a point of the world is seen: it lies there in the filled-up image, too."""
+    frames = rotated(walk, [5])
+    pixels = np.zeros((64, 48, 3), np.uint8)
+    pixels[12:16, 32:36] = 255
+    Image.fromarray(pixels).save(walk.folder / "images" / "5.png")
+    scan = opened(walk, frames=frames)
+    own = torch.tensor([[51.0, 0, 25], [0, 50, 31], [0, 0, 1]], dtype=torch.float64)
+    camera = scan.cameras[5]
+    ray = torch.linalg.inv(own) @ torch.tensor([34.0, 14.0, 1.0], dtype=torch.float64)
+    point = camera.world_from_camera[:3, :3] @ (2 * ray) + camera.position
+    for size in ((48, 64), (240, 320), (96, 64)):
+        scaled = camera.scaled_to(size)
+        place, depth = scaled.project(point[None])
+        assert scaled.sees(place, depth).all()
+        image = scan.read_color(5, size)[..., 0].astype(float)
+        image[(scan.read_color(5, size) == np.array(FILL)).all(axis=2)] = 0
+        rows, columns = np.mgrid[: size[0], : size[1]] + 0.5
+        found = (image * columns).sum() / image.sum(), (image * rows).sum() / image.sum()
+        assert place[0].tolist() == pytest.approx(found, abs=0.15)
+
+
+def test_a_stray_picture_is_used_with_a_lens_of_its_own_and_dropped_without(walk):
+    frames = transforms(walk)["frames"]
+    for n in (2, 6):
+        Image.new("RGB", (300, 300), (20 * n,) * 3).save(walk.folder / "images" / f"{n}.png")
+    frames[11 - 6] |= {"w": 300, "h": 300, "fl_x": 250.0, "fl_y": 250.0, "cx": 150.0, "cy": 150.0}
+    scan = opened(walk, frames=frames)
+    assert scan.dropped == {"2": "image of another shape than its intrinsics are for"}
+    frame = scan.frame_id.index("6")
+    assert scan.picture[frame].tolist() == [8, 0, 56, 48]
+    assert scan.intrinsics[frame].numpy() == pytest.approx(np.array([[40, 0, 32], [0, 40, 24], [0, 0, 1.0]]))
+
+
+def test_the_most_frequent_size_is_that_of_the_scan(walk):
+    scan = opened(walk, frames=rotated(walk, range(7)))
+    assert scan.image_size == (64, 48)
+    assert scan.picture[0].tolist() == [0, 0, 48, 64]
+    assert scan.picture[11].tolist() == [0, 14, 48, 50]
+
+
+def test_each_distorted_frame_becomes_a_pinhole_of_its_own(walk):
+    frames = transforms(walk)["frames"]
+    frames[0] |= {"k1": 0.3}
+    frames[1] |= {"k1": -0.2}
+    frames[2] |= {"fl_x": 56.0, "fl_y": 57.1}
+    scan = opened(walk, frames=frames)
+    assert [lens.is_pinhole for lens in scan.lens] == [True] * 10 + [False] * 2
+    assert scan.intrinsics[11, 0, 0] > 50
+    assert scan.intrinsics[10, 0, 0] == 50
+    assert (scan.intrinsics[9, 0, 0], scan.intrinsics[0, 0, 0]) == (56, 50)
+    assert [scan.color_bytes(n) is None for n in range(12)] == [False] * 10 + [True] * 2
+
+
+def test_frames_that_no_lens_fits_are_counted_and_said(walk, caplog):
+    frames = transforms(walk)["frames"]
+    for n in (1, 4):
+        with Image.open(walk.folder / "images" / f"{n}.png") as image:
+            image.rotate(90, expand=True).save(walk.folder / "images" / f"{n}.png")
+    Image.new("RGB", (64, 64)).save(walk.folder / "images" / "8.png")
+    (walk.folder / "images" / "2.png").unlink()
+    with caplog.at_level(logging.INFO):
+        report_dropped(opened(walk, frames=frames))
+    assert caplog.messages == [
+        "walk: dropped 4 of 12 frames (2 image turned by 90° against its intrinsics, 1 no image, "
+        "1 image of another shape than its intrinsics are for)"
+    ]
