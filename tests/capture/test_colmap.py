@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import shutil
-import struct
 from dataclasses import replace
 
 import numpy as np
@@ -260,23 +259,3 @@ def test_a_focal_length_that_is_off_is_its_own(walk):
     assert scan.dropped == {}
     assert scan.intrinsics[:, 0, 0].tolist() == [56.0 if n == 6 else 50.0 for n in range(12)]
     assert all(scan.color_bytes(n) is not None for n in range(12))
-
-
-@pytest.mark.parametrize("binary", [True, False])
-def test_a_camera_that_is_none_costs_its_own_images_alone(walk, binary):
-    folder = walk.folder / "sparse" / "0"
-    write_colmap(walk, folder, binary=binary, model="SIMPLE_RADIAL", parameters=[50, 32, 24, 0], cameras=4)
-    if binary:
-        content = bytearray((folder / "cameras.bin").read_bytes())
-        struct.pack_into("<d", content, 8 + 2 * 56 + 24, -50.0)
-        (folder / "cameras.bin").write_bytes(content)
-    else:
-        lines = (
-            (folder / "cameras.txt")
-            .read_text()
-            .replace("\n3 SIMPLE_RADIAL 64 48 50.0", "\n3 SIMPLE_RADIAL 64 48 -50")
-        )
-        (folder / "cameras.txt").write_text(lines)
-    scan = open_recording(read_colmap(walk.folder))
-    assert scan.frame_id == tuple(str(n) for n in range(12) if n % 4 != 2)
-    assert set(scan.dropped.values()) == {"focal lengths and centre not positive and finite"}

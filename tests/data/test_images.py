@@ -19,6 +19,7 @@ from raytran.data.images import (
     read_frames,
     resize,
     stored_size,
+    stored_sizes,
 )
 from raytran.errors import DataError
 
@@ -220,3 +221,13 @@ def test_a_picture_keeps_its_place_to_a_fraction_of_a_pixel(image_size) -> None:
 def test_a_picture_narrower_than_a_pixel_shows_nothing() -> None:
     filled = fill_up(np.zeros((400, 1, 3), np.uint8), (319, 0, 320, 480), (480, 640), (12, 16))
     assert (filled == np.array(FILL)).all()
+
+
+def test_the_stored_size_is_that_of_most_images(paths) -> None:
+    """Whichever comes first."""
+    for path, size in zip(paths, [(9, 9), (16, 8), (8, 16), (16, 8), (16, 8), (8, 16)], strict=True):
+        Image.new("RGB", size).save(path)
+    write_claiming_png(paths[2], 100_000)
+    paths[5].write_bytes(b"no image")
+    assert stored_size(paths) == (8, 16)
+    assert stored_sizes(paths) == [(9, 9), (8, 16), None, (8, 16), (8, 16), None]

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from raytran.capture.lens import Lens
+from raytran.capture.lens import Lens, check_lens
 from raytran.capture.recording import Frame, Recording, frame_name, images_in, number, numbers, read_json
 from raytran.capture.trajectory import Track, poses_at, read_table
 from raytran.data.images import stored_size
@@ -102,7 +102,7 @@ def _scanner_frame(content: Mapping[str, Any], image: Path, size: tuple[int, int
     pose = numbers(content, "cameraPoseARFrame", where, (4, 4))
     matrix = numbers(content, "intrinsics", where, (3, 3))
     lens = Lens(size, (matrix[0, 0], matrix[1, 1]), (matrix[0, 2], matrix[1, 2]))
-    return Frame(frame_name(image.name), image, pose, lens)
+    return Frame(frame_name(image.name), image, pose, check_lens(lens, where))
 
 
 def _polycam_frame(content: Mapping[str, Any], image: Path, size: tuple[int, int], where: str) -> Frame:
@@ -111,7 +111,7 @@ def _polycam_frame(content: Mapping[str, Any], image: Path, size: tuple[int, int
     keys = ("fx", "fy", "cx", "cy", "width", "height")
     fx, fy, cx, cy, width, height = (number(content, key, where) for key in keys)
     lens = Lens((int(height), int(width)), (fx, fy), (cx, cy))
-    return Frame(frame_name(image.name), image, pose, lens)
+    return Frame(frame_name(image.name), image, pose, check_lens(lens, where))
 
 
 def _read_arkitscenes(listed: Path, scene_id: str) -> Recording:
@@ -157,7 +157,7 @@ def _pincam(path: Path) -> Lens:
     if values.size != 6:
         raise DataError(f"{path} does not hold `width height fx fy cx cy`: download it again")
     width, height, fx, fy, cx, cy = values.ravel().tolist()
-    return Lens((int(height), int(width)), (fx, fy), (cx, cy))
+    return check_lens(Lens((int(height), int(width)), (fx, fy), (cx, cy)), str(path))
 
 
 def _time(path: Path) -> float:

@@ -15,22 +15,14 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from raytran.capture.lens import Lens, UnfitLens, colmap_lens, lens_model
-from raytran.capture.recording import (
-    Frame,
-    Recording,
-    frame_name,
-    lens_or_fault,
-    path_inside,
-    unposed_images,
-)
+from raytran.capture.lens import Lens, colmap_lens, lens_model
+from raytran.capture.recording import Frame, Recording, frame_name, path_inside, unposed_images
 from raytran.errors import DataError
 from raytran.geometry.rotation import matrix_from_quaternion
 
@@ -144,8 +136,8 @@ def _world_from_camera(images: list[_Image]) -> NDArray[np.float64]:
     return poses.numpy()
 
 
-def _cameras_text(path: Path) -> dict[int, Lens | UnfitLens]:
-    lenses: dict[int, Lens | UnfitLens] = {}
+def _cameras_text(path: Path) -> dict[int, Lens]:
+    lenses = {}
     for row, line in _lines(path):
         if not line.strip():
             continue
@@ -156,8 +148,7 @@ def _cameras_text(path: Path) -> dict[int, Lens | UnfitLens]:
             values = [float(value) for value in params]
         except ValueError as error:
             raise DataError(f"line {row} of {path} is no camera ({error}): export the model again") from error
-        where = f"camera {camera} in {path}"
-        lenses[camera] = lens_or_fault(partial(colmap_lens, model, size, values, where))
+        lenses[camera] = colmap_lens(model, size, values, f"camera {camera} in {path}")
     return lenses
 
 
@@ -190,8 +181,8 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
         raise DataError(f"cannot read {path} ({error}): export the model again") from error
 
 
-def _cameras_binary(path: Path) -> dict[int, Lens | UnfitLens]:
-    lenses: dict[int, Lens | UnfitLens] = {}
+def _cameras_binary(path: Path) -> dict[int, Lens]:
+    lenses = {}
     with _mapped(path) as data:
         (count,) = struct.unpack_from("<Q", data, 0)
         at = 8
@@ -200,7 +191,7 @@ def _cameras_binary(path: Path) -> dict[int, Lens | UnfitLens]:
             where = f"camera {number} in {path}"
             layout = f"<{lens_model(model, where).num_params}d"
             params = struct.unpack_from(layout, data, at + 24)
-            lenses[number] = lens_or_fault(partial(colmap_lens, model, (height, width), params, where))
+            lenses[number] = colmap_lens(model, (height, width), params, where)
             at += 24 + struct.calcsize(layout)
     return lenses
 

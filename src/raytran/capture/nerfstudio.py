@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,6 @@ from raytran.capture.recording import (
     Frame,
     Recording,
     frame_name,
-    lens_or_fault,
     number,
     numbers,
     path_inside,
@@ -75,7 +73,7 @@ def read_nerfstudio(path: Path) -> Recording:
     for i, (entry, image) in enumerate(zip(entries, images, strict=True)):
         where = f"frame {i} of {listed}"
         name = frame_name(image.relative_to(root).as_posix())
-        lens = lens_or_fault(partial(frame_lens, entry, size, where))
+        lens = frame_lens(entry, size, where)
         frames.append(Frame(name, image, frame_pose(entry, undo, where), lens))
     return Recording(
         path=listed,

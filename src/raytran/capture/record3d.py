@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from raytran.capture.lens import Lens
+from raytran.capture.lens import Lens, check_lens
 from raytran.capture.recording import Frame, Recording, frame_name, images_in, number, numbers, read_json
 from raytran.capture.trajectory import rotations
 from raytran.errors import DataError
@@ -69,4 +69,4 @@ def _lenses(content: dict[str, Any], count: int, where: str) -> list[Lens]:
         # K is written column by column.
         matrix = numbers(content, "K", where, (3, 3)).T
         table = np.tile(matrix[[0, 1, 0, 1], [0, 1, 2, 2]], (count, 1))
-    return [Lens(size, (fx, fy), (cx, cy)) for fx, fy, cx, cy in table.tolist()]
+    return [check_lens(Lens(size, (fx, fy), (cx, cy)), where) for fx, fy, cx, cy in table.tolist()]

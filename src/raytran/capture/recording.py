@@ -7,9 +7,11 @@ The helpers at the end, for names, image folders and JSON files, trust nothing t
 from __future__ import annotations
 
 import json
+import logging
 import math
 import os
 from abc import ABC, abstractmethod
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -30,18 +32,12 @@ from raytran.capture.lens import (
     resample,
 )
 from raytran.data.images import box_within, decode_image, fill_up, has_shape, is_turned, stored_size
-from raytran.data.scan import (
-    LOST,
-    NO_IMAGE,
-    NO_POSE,
-    OTHER_SHAPE,
-    TURNED,
-    OpenScan,
-    count_reasons,
-    numbers_first,
-)
+from raytran.data.scan import LOST, NO_IMAGE, NO_POSE, OTHER_SHAPE, TURNED, OpenScan, numbers_first
 from raytran.data.scannet.text import are_rigid
 from raytran.errors import DataError
+from raytran.geometry.camera import is_off_center
+
+_log = logging.getLogger(__name__)
 
 Axes = Literal["opencv", "opengl"]
 """Axes of a camera: x right, y down, z forward; or x right, y up, z backward."""
@@ -62,14 +58,14 @@ class Frame:
         name: of the frame; fit for a file name.
         image: its file, or the video it is in.
         world_from_camera: ``(4, 4)`` float64, unit and axes of the recording.
-        lens: for the image size that the recording states; or why the frame is left out.
+        lens: for the image size that the recording states.
         number: of the frame in a video.
     """
 
     name: str
     image: Path
     world_from_camera: NDArray[np.float64]
-    lens: Lens | UnfitLens
+    lens: Lens
     number: int = 0
 
 
@@ -236,6 +232,7 @@ def build_scan(
     boxes = [box_within(size, image_size) for size in sizes]
     matrices = [_brought_to(pinhole, box) for pinhole, box in zip(pinholes, boxes, strict=True)]
     is_whole = all(has_shape(size, image_size) for size in sizes)
+    _report_cameras(recording, lenses, image_size)
     poses = np.array([frame.world_from_camera for frame in frames])
     return RecordedScan(
         scene_id=recording.scene_id,
@@ -251,6 +248,24 @@ def build_scan(
         lens=tuple(lenses),
         pinhole=tuple(pinholes),
     )
+
+
+def _report_cameras(recording: Recording, lenses: list[Lens], image_size: tuple[int, int]) -> None:
+    """Log how many images are filled up, and how many look like crops."""
+    others = sum(not has_shape(lens.size, image_size) for lens in lenses)
+    if others:
+        _log.info(
+            "%s: %d of %d images are of another shape than %dx%d and are filled up to it",
+            *(recording.scene_id, others, len(lenses), image_size[1], image_size[0]),
+        )
+    cropped = [lens for lens in lenses if is_off_center(lens.center, lens.size)]
+    if cropped:
+        (cx, cy), (height, width) = cropped[0].center, cropped[0].size
+        _log.warning(
+            "%s: %d of %d images have their principal point far from the middle, the first at (%.0f, %.0f) "
+            "of %dx%d, and are taken for crops: if they are none, give the intrinsics of the stored images",
+            *(recording.scene_id, len(cropped), len(lenses), cx, cy, width, height),
+        )
 
 
 def _brought_to(pinhole: Lens, box: tuple[int, int, int, int]) -> Tensor:
@@ -300,9 +315,10 @@ def _usable(
         return frames, lenses, dropped
     if len(unfit) > len(dropped) / 2:
         raise next(iter(unfit.values()))
+    reasons = ", ".join(f"{count} {reason}" for reason, count in Counter(dropped.values()).most_common())
     raise DataError(
         f"none of the {len(dropped)} frames of {recording.path} has an image and a valid pose "
-        f"({count_reasons(dropped)}): check that its images lie beside it under the names it gives"
+        f"({reasons}): check that its images lie beside it under the names it gives"
     )
 
 
@@ -310,10 +326,8 @@ def _lens_for_size(frame: Frame, size: tuple[int, int], listed_in: Path) -> Lens
     """Return the frame's lens for the stored size ``(H, W)`` of its image.
 
     Raises:
-        UnfitLens: it has none, or one for images of another shape.
+        UnfitLens: it is none, or one for images of another shape.
     """
-    if isinstance(frame.lens, UnfitLens):
-        raise frame.lens
     height, width = frame.lens.size
     if min(height, width) > 0 and not has_shape(size, frame.lens.size):
         turned = is_turned(size, frame.lens.size)
@@ -329,20 +343,6 @@ def _lens_for_size(frame: Frame, size: tuple[int, int], listed_in: Path) -> Lens
 
 def _camera_of(frame: Frame, listed_in: Path) -> str:
     return f"the camera of {frame.name} in {listed_in}"
-
-
-def lens_or_fault(read: Callable[[], Lens]) -> Lens | UnfitLens:
-    """Return the lens that ``read`` reads, or why it cannot: one frame's lens must not cost the others.
-
-    Raises:
-        ConfigError: it distorts and pycolmap is not installed.
-    """
-    try:
-        return read()
-    except UnfitLens as error:
-        return error
-    except DataError as error:
-        return UnfitLens(str(error), "intrinsics that cannot be read")
 
 
 def frame_name(image: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import cache
 from io import BytesIO
@@ -229,19 +230,42 @@ class _Reader:
 
 
 def stored_size(paths: Sequence[Path]) -> tuple[int, int]:
-    """Return ``(H, W)`` of the first image whose header can be read.
+    """Return the most frequent ``(H, W)`` of the images whose headers can be read.
 
     Raises:
-        DataError: there is none, or it is larger than ``MAX_SIDE``.
+        DataError: there is none, or they are larger than ``MAX_SIDE``.
     """
+    sizes = Counter(size for size in stored_sizes(paths) if size is not None)
+    if not sizes:
+        if paths and paths[0].is_file():
+            _size_of(paths[0])  # It may say why.
+        raise DataError(f"no image in {paths[0].parent} can be read: copy or export them again")
+    return sizes.most_common(1)[0][0]
+
+
+def stored_sizes(paths: Sequence[Path]) -> list[tuple[int, int] | None]:
+    """Return ``(H, W)`` of each image, None where its header cannot be read or claims too many pixels."""
+    sizes: list[tuple[int, int] | None] = []
     for path in paths:
         try:
-            with Image.open(path) as image:
-                _check_sides(image.size, str(path))
-                return image.size[1], image.size[0]
-        except _UNREADABLE:
-            continue
-    raise DataError(f"no image in {paths[0].parent} can be read: copy or export them again")
+            sizes.append(_size_of(path))
+        except DataError:
+            sizes.append(None)
+    return sizes
+
+
+def _size_of(path: Path) -> tuple[int, int] | None:
+    """Return ``(H, W)`` of an image, None if its header cannot be read.
+
+    Raises:
+        DataError: it is larger than ``MAX_SIDE``.
+    """
+    try:
+        with Image.open(path) as image:
+            _check_sides(image.size, str(path))
+            return image.size[1], image.size[0]
+    except _UNREADABLE:
+        return None
 
 
 def _check_sides(size: tuple[int, int], name: str) -> None:

@@ -6,8 +6,7 @@ from __future__ import annotations
 import logging
 import re
 from abc import ABC, abstractmethod
-from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -31,9 +30,6 @@ NO_POSE = "no pose"
 OTHER_SHAPE = "image of another shape than its intrinsics are for"
 TURNED = "image turned by 90° against its intrinsics"
 """Reasons why a frame is dropped."""
-
-_REASONS = 6
-"""Reasons that are told apart where frames are counted."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,23 +123,11 @@ def even_views(
 
 
 def report_dropped(scan: OpenScan) -> None:
-    """Log how many frames of a scan are left out, and for which reasons."""
+    """Log how many frames of a scan have no image or pose."""
     if scan.dropped:
         total = len(scan) + len(scan.dropped)
-        reasons = count_reasons(scan.dropped)
+        reasons = ", ".join(sorted(set(scan.dropped.values())))
         _log.info("%s: dropped %d of %d frames (%s)", scan.scene_id, len(scan.dropped), total, reasons)
-
-
-def count_reasons(dropped: Mapping[str, str]) -> str:
-    """Return for how many frames each reason holds, the most frequent first: ``3 no pose, 1 no image``.
-
-    Args:
-        dropped: reason for each frame that is left out, by its name.
-    """
-    counts = Counter(dropped[name] for name in sorted(dropped)).most_common()
-    text = [f"{count} {reason}" for reason, count in counts[:_REASONS]]
-    others = sum(count for _, count in counts[_REASONS:])
-    return ", ".join([*text, *([f"{others} for other reasons"] if others else [])])
 
 
 def scan_views(

@@ -221,6 +221,11 @@ def center_offset(center: tuple[float, float], image_size: tuple[int, int]) -> f
     return max(abs(center[0] / image_size[1] - 0.5), abs(center[1] / image_size[0] - 0.5))
 
 
+def is_off_center(center: tuple[float, float], image_size: tuple[int, int]) -> bool:
+    """Whether a principal point is that of a crop, if its intrinsics are for images of ``(H, W)`` at all."""
+    return center_offset(center, image_size) > _OFF_CENTER
+
+
 def other_image_size(center: tuple[float, float], image_size: tuple[int, int]) -> tuple[int, int] | None:
     """Return for which other size ``(H, W)`` intrinsics seem to be, or None if they may be for this one.
 
@@ -232,7 +237,7 @@ def other_image_size(center: tuple[float, float], image_size: tuple[int, int]) -
         image_size: ``(H, W)`` of the images.
     """
     width, height = 2 * center[0], 2 * center[1]
-    if center_offset(center, image_size) <= _OFF_CENTER or min(width, height) <= 0:
+    if not is_off_center(center, image_size) or min(width, height) <= 0:
         return None
     aspect = image_size[1] / image_size[0]
     same = any(abs(width / height / other - 1) < _SAME for other in (aspect, 1 / aspect, 1.0))

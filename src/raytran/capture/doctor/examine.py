@@ -30,7 +30,7 @@ from raytran.capture.doctor.objects import (
 )
 from raytran.capture.frames import RawScan, read_grey
 from raytran.capture.orientation import check_unit, check_up
-from raytran.data.scan import OpenScan, count_reasons
+from raytran.data.scan import OpenScan
 from raytran.data.scan2cad import SceneAnnotation, scene_objects
 from raytran.data.scannet.find import ScanSource
 from raytran.data.scannet.layout import find_layout
@@ -222,7 +222,8 @@ def _check_files(raw: RawScan) -> list[Finding]:
     total = len(scan) + len(scan.dropped)
     text = f"all {total} are usable"
     if scan.dropped:
-        text = f"{len(scan.dropped)} of {total} frames are left out ({count_reasons(scan.dropped)})"
+        reasons = "; ".join(sorted(set(scan.dropped.values())))
+        text = f"{len(scan.dropped)} of {total} frames are left out ({reasons})"
     frames = Finding("frames", "note" if scan.dropped else "ok", text)
     if len(scan.dropped) > total / 2 or scan.damage:
         fix = "export the scan again; frames whose tracking was lost cannot be mended"

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from raytran.data.images import decode_image, has_shape, is_turned, stored_size
+from raytran.data.images import decode_image, has_shape, is_turned, stored_size, stored_sizes
 from raytran.data.scan import (
     LOST,
     NO_IMAGE,
@@ -158,10 +158,10 @@ def read_scan(folder: Path, *, header: Path | None = None, any_size: bool = Fals
         )
     header = header or folder / f"{folder.name}.txt"
     facts = read_header(header)
-    sizes = _stored_sizes([images[name] for name in names])
+    found = stored_sizes([images[name] for name in names])
     intrinsics_file = layout.intrinsics()
     image_size, intrinsics = _fitting_size(
-        sizes,
+        [size for size in found if size is not None] or [stored_size([images[name] for name in names])],
         partial(
             check_intrinsics,
             read_intrinsics(intrinsics_file),
@@ -170,6 +170,8 @@ def read_scan(folder: Path, *, header: Path | None = None, any_size: bool = Fals
             any_size=any_size,
         ),
     )
+    # An image whose header cannot be read is named when it is read.
+    sizes = [size or image_size for size in found]
     fits = [has_shape(size, image_size) for size in sizes]
     for name, size, has_right_shape in zip(names, sizes, fits, strict=True):
         if not has_right_shape:
@@ -189,24 +191,6 @@ def read_scan(folder: Path, *, header: Path | None = None, any_size: bool = Fals
         axis_alignment=axis_alignment(facts, header),
         dropped={name: dropped[name] for name in sorted(dropped, key=numbers_first)},
     )
-
-
-def _stored_sizes(paths: Sequence[Path]) -> list[tuple[int, int]]:
-    """Return ``(H, W)`` of images; one whose header cannot be read has that of the first that can be.
-
-    Such an image is named when it is read.
-
-    Raises:
-        DataError: none can be read.
-    """
-    first = stored_size(paths)
-    sizes = []
-    for path in paths:
-        try:
-            sizes.append(stored_size([path]))
-        except DataError:
-            sizes.append(first)
-    return sizes
 
 
 def _fitting_size(

@@ -82,7 +82,6 @@ def render_views(
                 cameras[indices][None].to(device),
                 views_at_once=views_at_once,
                 grid_center=center.float().to(device),
-                check=False,  # What files say was checked when they were read.
             )
             rendered = (image for chunk in images for image in chunk.cpu())
             for index, image in zip(indices, rendered, strict=True):

@@ -184,7 +184,6 @@ def predict_room(
             views_at_once=views_at_once,
             with_shapes=with_shapes,
             grid_center=grid_center,
-            check=False,  # What files say was checked when they were read.
         ).to("cpu")
         prediction = select_objects(prediction, score_threshold=score_threshold, duplicate_iou=duplicate_iou)
         objects = count_object_views(prediction, grid_extent=model.grid_extent)
