@@ -158,11 +158,15 @@ def mirror_scene(scene: SceneBatch) -> SceneBatch:
     intrinsics = views.intrinsics.clone()
     intrinsics[..., 0, 1] *= -1
     intrinsics[..., 0, 2] = width - intrinsics[..., 0, 2]
+    picture = views.picture
+    if picture is not None:
+        left, top, right, bottom = picture.unbind(dim=-1)
+        picture = torch.stack([width - right, top, width - left, bottom], dim=-1)
     mirror = _in_identity(_MIRROR, 4)
     pose = _product(mirror, views.world_from_camera, mirror)
     return _changed(
         scene,
-        views=Views(views.images.flip(-1), intrinsics, pose),
+        views=Views(views.images.flip(-1), intrinsics, pose, picture),
         grid_center=_product(_MIRROR, scene.grid_center[..., None])[..., 0],
         change=_mirrored,
         foreground=None if scene.foreground is None else scene.foreground.flip(-1),

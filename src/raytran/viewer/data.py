@@ -116,8 +116,7 @@ class ViewerScene:
 
     def camera(self, frame: int) -> Cameras:
         """Return the camera of one frame, no leading dimensions."""
-        cameras = self.cameras
-        return Cameras(cameras.intrinsics[frame], cameras.world_from_camera[frame], cameras.image_size)
+        return self.cameras[frame]
 
     @property
     def occupancy(self) -> Tensor | None:
@@ -180,10 +179,8 @@ def _read_volumes(
     features = observed.runs([len(frames) * size[0] * size[1] for _, frames in runs])
     volumes = []
     for (center, frames), (query, key) in zip(runs, features, strict=True):
-        index = list(frames)
-        pose = views.world_from_camera[0, index].cpu()
-        cameras = Cameras(views.intrinsics[0, index].cpu(), pose, views.image_size)
-        grid = VoxelGrid(model.grid_resolution, model.grid_extent, center.to(pose))
+        cameras = Cameras.of(views.scene())[list(frames)].to("cpu")
+        grid = VoxelGrid(model.grid_resolution, model.grid_extent, center.to(cameras.position))
         pairs = trace_pairs(cameras, grid, size, model.rays_per_cell)
         reads = pack_reads(attention_weights(query, key, pairs), pairs, size)
         volumes.append(VoxelVolume(grid, frames, reads=reads))
@@ -222,6 +219,8 @@ def write_viewer_data(
         "intrinsics": views.intrinsics[0].double().cpu().numpy(),
         "world_from_camera": views.world_from_camera[0].double().cpu().numpy(),
     }
+    if views.picture is not None:
+        arrays["picture"] = views.picture[0].double().cpu().numpy()
     for n in range(len(frame_ids)):
         arrays[f"frame{n}"] = _jpeg(frame_image(views, n))
     for n, volume in enumerate(volumes):
@@ -289,13 +288,14 @@ def read_viewer_scene(folder: Path) -> ViewerScene:
         truth = _truth(arrays) if about["has_truth"] else None
         height, width = about["image_size"]
         pose = torch.from_numpy(arrays["world_from_camera"])
+        picture = torch.from_numpy(arrays["picture"]) if "picture" in arrays else None
         return ViewerScene(
             scene_id=result.scene_id,
             objects=objects,
             meshes=meshes,
             frame_ids=[str(name) for name in about["frame_ids"]],
             images=[_image(arrays[f"frame{n}"]) for n in range(len(about["frame_ids"]))],
-            cameras=Cameras(torch.from_numpy(arrays["intrinsics"]), pose, (height, width)),
+            cameras=Cameras(torch.from_numpy(arrays["intrinsics"]), pose, (height, width), picture),
             volumes=[_volume(entry, n, arrays) for n, entry in enumerate(about["volumes"])],
             truth=truth,
             errors=[None] * len(objects) if truth is None else object_errors(objects, truth),

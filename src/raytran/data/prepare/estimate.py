@@ -20,7 +20,6 @@ from raytran.data.prepare.report import gigabytes
 from raytran.data.prepare.scan import PrepareSettings, ScanJob, choose_frames, encoded_frame
 from raytran.data.prepare.targets import prepare_model, write_masks
 from raytran.errors import DataError
-from raytran.geometry.camera import Cameras
 
 _SAMPLES = 3
 """Number of models, of scans, and of frames of each of these scans that are prepared for the estimate."""
@@ -133,8 +132,6 @@ def _frame_cost(
         chosen = choose_frames(len(scan), _SAMPLES)
         written = sum(len(encoded_frame(scan, position, settings.image_size)[0]) for position in chosen)
         if entry is not None:
-            intrinsics = scan.intrinsics.expand(len(chosen), 3, 3)
-            cameras = Cameras(intrinsics, scan.world_from_camera[chosen], scan.image_size)
-            write_masks(entry, cameras.scaled_to(settings.image_size), trial)
+            write_masks(entry, scan.cameras[chosen].scaled_to(settings.image_size), trial)
     seconds = time.perf_counter() - started
     return (written + bytes_below(trial) - before) / len(chosen), seconds / len(chosen)

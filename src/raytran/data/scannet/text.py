@@ -10,16 +10,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from raytran.data.images import is_turned
 from raytran.errors import DataError
+from raytran.geometry.camera import FARTHEST_CENTER, center_offset, other_image_size
+from raytran.geometry.checks import rigid_motions
 
 INFO_FILES = ("_info.txt", "info.txt")
 """Names of the C++ exporter's file of facts."""
 
 _MAX_BYTES = 1 << 20
 """Bytes of a file that are read; ScanNet's files have some hundred."""
-
-_MAX_OFFSET = 0.15
-"""Largest distance of the principal point from the image centre, in widths or heights."""
 
 
 def read_matrix(path: Path) -> NDArray[np.float64] | None:
@@ -32,10 +32,8 @@ def read_matrix(path: Path) -> NDArray[np.float64] | None:
 
 def are_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which of ``(n, 4, 4)`` matrices are finite and hold a rotation in their upper left, ``(n,)``."""
-    finite = np.asarray(np.isfinite(poses).all(axis=(1, 2)))
-    rotation = np.where(finite[:, None, None], poses[:, :3, :3], 0.0)
-    error = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
-    return finite & (error < 0.01) & (np.linalg.det(rotation) > 0)
+    is_rigid: NDArray[np.bool_] = rigid_motions(torch.from_numpy(poses)).numpy()
+    return is_rigid
 
 
 def read_header(path: Path) -> dict[str, str]:
@@ -110,18 +108,27 @@ def check_intrinsics(
     if any_size:
         return torch.from_numpy(matrix[:3, :3].copy())
     height, width = image_size
-    distance = _distance_from_centre(matrix, width, height)
+    center = float(matrix[0, 2]), float(matrix[1, 2])
+    distance = center_offset(center, image_size)
     try:
         stated = int(header.get("colorWidth", width)), int(header.get("colorHeight", height))
     except ValueError:
         stated = width, height
     # A header may state 0 for a size it does not know.
     fits_stated_size = (
-        min(stated) > 0 and stated != (width, height) and _distance_from_centre(matrix, *stated) < distance
+        min(stated) > 0
+        and stated != (width, height)
+        and center_offset(center, (stated[1], stated[0])) < distance
     )
-    if distance > _MAX_OFFSET or fits_stated_size:
+    other = other_image_size(center, image_size)
+    if other is not None and is_turned(other, image_size):
         raise DataError(
-            f"{path} has its principal point at ({matrix[0, 2]:.1f}, {matrix[1, 2]:.1f}), so it is for "
+            f"{path} has its principal point at ({center[0]:.1f}, {center[1]:.1f}), so it is for images "
+            f"turned by 90° against the stored {width}x{height}: give the intrinsics of the stored images"
+        )
+    if other is not None or distance > FARTHEST_CENTER or fits_stated_size:
+        raise DataError(
+            f"{path} has its principal point at ({center[0]:.1f}, {center[1]:.1f}), so it is for "
             f"another image size than the stored {width}x{height}: "
             "scale its first row by W'/W and its second by H'/H"
         )
@@ -140,7 +147,3 @@ def _matrix(text: str) -> NDArray[np.float64]:
     matrix = np.eye(4)
     matrix[:3, :3] = values.reshape(3, 3)
     return matrix
-
-
-def _distance_from_centre(matrix: NDArray[np.float64], width: int, height: int) -> float:
-    return max(abs(matrix[0, 2] / width - 0.5), abs(matrix[1, 2] / height - 0.5))
