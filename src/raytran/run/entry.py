@@ -9,15 +9,21 @@ import os
 import re
 import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import ConfigCompositionException, InstantiationException, OverrideParseException
+from hydra.errors import (
+    ConfigCompositionException,
+    InstantiationException,
+    MissingConfigException,
+    OverrideParseException,
+)
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -55,6 +61,11 @@ _KEY = re.compile(r"[+~]{0,2}[A-Za-z_][\w./@:-]*")
 
 _SEVERAL_VALUES = re.compile(r"Ambiguous value for argument '(.*)'$", re.DOTALL)
 """How Hydra begins to say that a comma makes a sweep of a single run."""
+
+_UNKNOWN = re.compile(r"Could not override '(.*)'$")
+"""How Hydra begins to say that there is no such setting."""
+
+_MOST_SUGGESTIONS = 3
 
 _KEEP_A_LOG = ("train", "curriculum")
 """Commands for which Hydra writes files of its own into the folder of the run."""
@@ -110,7 +121,7 @@ def _compose_or_exit(name: str, command: Callable[[], Any], typed: str | None) -
         return command()
     except ConfigCompositionException as error:
         _set_full_error(typed)
-        _exit_with(_no_such_setting(error, sys.argv[1:]))
+        _exit_with(_no_such_setting(name, error, sys.argv[1:]))
     except OverrideParseException as error:
         _set_full_error(typed)
         _exit_with(_unreadable_setting(error))
@@ -129,7 +140,7 @@ def _compose_or_exit(name: str, command: Callable[[], Any], typed: str | None) -
         _exit_with(ConfigError(_first_line(error).split("resolving interpolation: ")[-1]))
 
 
-def _no_such_setting(error: ConfigCompositionException, typed: Sequence[str]) -> ConfigError:
+def _no_such_setting(name: str, error: ConfigCompositionException, typed: Sequence[str]) -> ConfigError:
     """Return what to say of settings that Hydra does not know; of those it knew once, what they are now."""
     for word in typed:
         for pattern, now in _RENAMED:
@@ -140,7 +151,32 @@ def _no_such_setting(error: ConfigCompositionException, typed: Sequence[str]) ->
             f"{several[1]} gives several values: if it is one, put it in quotes inside of the shell's, as in "
             f"{_in_quotes(several[1])}, or add -m to run a sweep"
         )
+    if unknown := _UNKNOWN.match(_first_line(error)):
+        meant = _similar_settings(name, unknown[1])
+        remedy = f"is {' or '.join(meant)} meant?" if meant else "--cfg job lists all"
+        return ConfigError(f"there is no setting {unknown[1]}: {remedy}")
+    if isinstance(error, MissingConfigException) and error.options:
+        return ConfigError(f"{_first_line(error)}: choose one of {', '.join(error.options)}")
     return ConfigError(f"{_first_line(error)}: there is no such setting or choice (--help lists them)")
+
+
+def _similar_settings(name: str, typed: str) -> list[str]:
+    """Return the settings of a command that somebody may mean who types one that it does not have."""
+    try:
+        content: Any = OmegaConf.to_container(compose(name, []))
+    except ConfigError:
+        return []
+    known = list(_dotted(content))
+    last = typed.rpartition(".")[2]
+    same = [setting for setting in known if setting.rpartition(".")[2] == last]
+    return same if 0 < len(same) <= _MOST_SUGGESTIONS else get_close_matches(typed, known, n=1, cutoff=0.8)
+
+
+def _dotted(content: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    for key, value in content.items():
+        yield f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            yield from _dotted(value, f"{prefix}{key}.")
 
 
 def _unreadable_setting(error: OverrideParseException) -> ConfigError:
@@ -228,7 +264,7 @@ def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
         try:
             return hydra.compose(config_name, overrides=literal_paths(config_name, overrides))
         except ConfigCompositionException as error:
-            raise _no_such_setting(error, overrides) from error
+            raise _no_such_setting(config_name, error, overrides) from error
         except OverrideParseException as error:
             raise _unreadable_setting(error) from error
 
