@@ -108,8 +108,8 @@ class ResNet18(ImageEncoder):
         if weights is not None:
             if width != 64:
                 raise ConfigError(
-                    f"pretrained weights need resnet width 64, got {width}: set model.backbone.encoder.width=64, "
-                    "or model.backbone.encoder.weights=null"
+                    f"pretrained weights need resnet width 64, got {width}: "
+                    "set model.backbone.encoder.width=64, or model.backbone.encoder.weights=null"
                 )
             self._load(weights)
 
