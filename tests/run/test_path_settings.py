@@ -17,6 +17,7 @@ from raytran.errors import ConfigError
 from raytran.run.config_dir import config_dir
 from raytran.run.entry import compose, name_positional
 from raytran.run.path_settings import PATH_SETTINGS, check_run_folder, literal_paths, quoted
+from raytran.run.train.build import build_data
 
 NAMES = [
     *(
@@ -172,6 +173,8 @@ def test_settings_that_refer_to_a_path_get_it_too(name):
     cfg = compose("train", ["preset=tiny", f"data.root={name}", "output_dir=x"])
     assert cfg.data.root == name
     assert cfg.data.dataset.cache_dir == f"{name}/cache"
+    data = build_data(cfg)
+    assert (str(data.root), str(data._dataset.keywords["cache_dir"])) == (name, f"{name}/cache")
 
 
 @pytest.mark.parametrize(
@@ -305,6 +308,13 @@ def test_a_mistake_in_another_setting_says_how_to_write_it(typed, command, tmp_p
     assert typed in sentence
     (way_out,) = shlex.split(sentence[sentence.index("as in ") + 6 :].split(", or add -m")[0])
     assert compose("train", [way_out, "output_dir=x"])[key] == value
+
+
+def test_options_may_stand_between_settings(command, tmp_path):
+    words = ["preset=tiny", "--cfg", "job", "data.root=a, (b)", "--resolve", "output_dir=x"]
+    done = command("train", *words, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "cache_dir: a, (b)/cache" in done.stdout
 
 
 def test_no_path_setting_of_conf_is_missing(project_root):

@@ -75,6 +75,8 @@ _WITH_VALUE = {
 }
 """Hydra's options that a word of their own may follow."""
 
+_WITH_OPTIONAL_VALUE = ("--info", "-i")
+
 _TYPED_FULL_ERROR = os.environ.get(_FULL_ERROR)
 
 
@@ -117,7 +119,7 @@ def _compose_or_exit(name: str, command: Callable[[], Any], typed: str | None) -
         if name in _KEEP_A_LOG:
             check_run_folder(sys.argv[1:])
         # Lightning starts further ranks with the words that it finds there.
-        sys.argv[1:] = literal_paths(name, sys.argv[1:])
+        sys.argv[1:] = literal_paths(name, _options_first(sys.argv[1:]))
         return command()
     except ConfigCompositionException as error:
         _set_full_error(typed)
@@ -138,6 +140,18 @@ def _compose_or_exit(name: str, command: Callable[[], Any], typed: str | None) -
         _set_full_error(typed)
         # A resolver of ours that objects is wrapped by OmegaConf; its message is the clearer one.
         _exit_with(ConfigError(_first_line(error).split("resolving interpolation: ")[-1]))
+
+
+def _options_first(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line with Hydra's options in front: it takes none between settings."""
+    options: list[str] = []
+    settings: list[str] = []
+    before = ""
+    for word in words:
+        is_value = before in _WITH_VALUE and (before not in _WITH_OPTIONAL_VALUE or "=" not in word)
+        (options if word.startswith("-") or is_value else settings).append(word)
+        before = word
+    return [*options, *settings]
 
 
 def _no_such_setting(name: str, error: ConfigCompositionException, typed: Sequence[str]) -> ConfigError:

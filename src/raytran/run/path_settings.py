@@ -64,10 +64,13 @@ _OF_A_RANK = "hydra.job.name=train_ddp_process_"
 def quoted(path: Path | str) -> str:
     """Return a path as Hydra's grammar of overrides wants it, so that it arrives as it is."""
     text = "./???" if str(path) == "???" else str(path)  # alone OmegaConf's sign for a value that is missing
-    if "${" in text:
-        # OmegaConf reads \${ as text, and two backslashes before it as one.
-        text = _REFERENCE.sub(lambda found: rf"{found[1] * 2}\${{", text)
-    return QuotedString(text=text, quote=Quote.double).with_quotes()
+    return QuotedString(text=without_references(text), quote=Quote.double).with_quotes()
+
+
+def without_references(text: str) -> str:
+    """Return a text that is ``text`` when OmegaConf has read it once, references and all."""
+    # OmegaConf reads \${ as text, and two backslashes before it as one.
+    return _REFERENCE.sub(lambda found: rf"{found[1] * 2}\${{", text)
 
 
 def literal_paths(command: str, words: Sequence[str]) -> list[str]:
