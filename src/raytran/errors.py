@@ -12,8 +12,8 @@ if TYPE_CHECKING:
 LONGEST = 290
 """Characters of an error's sentence; with the program's name before it 300 at most."""
 
-_LONG_WORD = 40
-"""Characters below which a word is kept whole as long as others are longer."""
+_KEPT_OF_WORDS = (40, 20)
+"""Characters that the longest words keep: so many first, so many if that does not do."""
 
 
 class RaytranError(Exception):
@@ -62,10 +62,11 @@ def one_line(text: str, longest: int = LONGEST) -> str:
         return text
     words = text.split(" ")
     too_many = len(text) - longest
-    while too_many > 0 and len(word := max(words, key=len)) > _LONG_WORD:
-        cut = _middle_cut(word, max(_LONG_WORD, len(word) - too_many))
-        words[words.index(word)] = cut
-        too_many -= len(word) - len(cut)
+    for kept in _KEPT_OF_WORDS:
+        while too_many > 0 and len(word := max(words, key=len)) > kept:
+            cut = _middle_cut(word, max(kept, len(word) - too_many))
+            words[words.index(word)] = cut
+            too_many -= len(word) - len(cut)
     return _middle_cut(" ".join(words), longest)
 
 
