@@ -49,7 +49,11 @@ def test_a_defect_keeps_its_traceback():
     ("typed", "said"),
     [
         ("learning_speed=3", "learning_speed"),
-        ("model=tinny", "model/tinny"),
+        ("model=tinny", "Could not find 'model/tinny': choose one of laptop, raytran, small, tiny"),
+        ("cache_dir=x", "there is no setting cache_dir: is data.dataset.cache_dir meant?"),
+        ("data.cache_dir=x", "is data.dataset.cache_dir meant?"),
+        ("trainer.maxsteps=3", "is trainer.max_steps meant?"),
+        ("nothing.like.it=3", "there is no setting nothing.like.it: --cfg job lists all"),
         ("seed", "key=value"),
         ("resume=elsewhere.ckpt", "give resume=auto"),
         ("schedule.joint.steps=3", "schedule.joint.steps=3 is called schedule.stage2.steps=3 now"),

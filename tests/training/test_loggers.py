@@ -142,6 +142,45 @@ def test_a_resumed_run_is_the_same_run(tmp_path):
     assert other.version != first.version
 
 
+def wandb_part(folder, *, online, monkeypatch):
+    """Begin as a run or a resumed run does; return W&B's settings, and leave the folder that W&B would."""
+    with monkeypatch.context() as context:
+        if online:
+            context.setenv("WANDB_API_KEY", "x" * 40)
+        settings = wandb_logger(project="p", name="n", save_dir=str(folder))._wandb_init
+    kind = "run" if online else "offline-run"
+    (folder / "wandb" / f"{kind}-20260131_120000-{settings['id']}").mkdir(parents=True, exist_ok=True)
+    return settings
+
+
+@pytest.mark.usefixtures("no_wandb_settings")
+@pytest.mark.parametrize(
+    ("online", "runs"),
+    [
+        ([True, True, True], [1, 1, 1]),
+        ([False, False, False], [1, 2, 3]),
+        ([True, False, True, True], [1, 2, 3, 3]),
+        ([False, True, True, False], [1, 2, 2, 3]),
+    ],
+)
+def test_no_part_of_a_run_can_replace_another(online, runs, tmp_path, monkeypatch):
+    folder = tmp_path / "stage1" / "monday"
+    parts = [wandb_part(folder, online=is_online, monkeypatch=monkeypatch) for is_online in online]
+    for run, part, is_online in zip(runs, parts, online, strict=True):
+        assert part["id"] == parts[runs.index(run)]["id"]
+        assert part["name"] == ("n" if run == 1 else f"n part {run}")
+        assert part["resume"] == ("allow" if is_online else None)
+        assert part["group"] == ("stage1 monday" if run > 1 or not is_online else None)
+    assert len({part["id"] for part in parts}) == max(runs)
+
+
+@pytest.mark.usefixtures("no_wandb_settings")
+def test_wandb_mode_offline_is_offline(tmp_path, monkeypatch):
+    monkeypatch.setenv("WANDB_API_KEY", "x" * 40)
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    assert wandb_logger(project="p", name="n", save_dir=str(tmp_path))._wandb_init["resume"] is None
+
+
 def test_runs_of_a_sweep_or_a_curriculum_are_a_group(tmp_path):
     (tmp_path / "sweeps" / "monday").mkdir(parents=True)
     job = tmp_path / "sweeps" / "monday" / "0" / "stage1"

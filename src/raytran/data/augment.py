@@ -60,11 +60,11 @@ class Augmentation:
         for name in ("yaw_deg", "mirror", "brightness", "contrast", "saturation", "hue_deg", "frame_dropout"):
             value, largest = getattr(self, name), 180 if name.endswith("_deg") else 1
             if not 0 <= value <= largest:
-                raise ConfigError(f"augmentation.{name}={value}: choose from 0 to {largest}")
+                raise ConfigError(f"data.augmentation.{name}={value}: choose from 0 to {largest}")
         shift = tuple(self.shift) if isinstance(self.shift, Sequence) else ()
         if len(shift) != 3 or not all(0 <= length < math.inf for length in shift):
             raise ConfigError(
-                f"augmentation.shift={self.shift}: give three lengths in metres, none of them negative"
+                f"data.augmentation.shift={self.shift}: give three lengths in metres, none of them negative"
             )
         object.__setattr__(self, "shift", shift)
 

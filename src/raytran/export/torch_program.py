@@ -164,7 +164,7 @@ def export_shapes(model: RayTran) -> ExportedProgram:
         ConfigError: the network has no shape head.
     """
     if "shape" not in model.heads:
-        raise ConfigError("this network has no shape head: export part=network")
+        raise ConfigError("this network has no shape head: export program.part=network")
     embedding = torch.zeros(3, model.backbone.channels)
     objects = Dim("objects", min=1)
     program = torch.export.export(model.heads["shape"], (embedding,), dynamic_shapes=({0: objects},))

@@ -24,6 +24,9 @@ _log = logging.getLogger(__name__)
 METRICS = "metrics.csv"
 WANDB_ID = "wandb-id.txt"
 
+_OFFLINE = ("offline", "dryrun")
+"""Values of WANDB_MODE with which W&B keeps to this machine; the second is its former name."""
+
 _GROUP_RECORDS = ("sweep.json", "curriculum.json")
 """Files by which the folder of a sweep or of a curriculum is known."""
 
@@ -181,26 +184,33 @@ def tensorboard_logger(*, save_dir: str) -> Any:
 def wandb_logger(*, project: str, name: str, save_dir: str) -> Any:
     """Return a logger to Weights & Biases, offline where the machine has no key; WANDB_MODE overrides.
 
-    A resumed run goes on as the same run there: its id is kept in ``wandb-id.txt`` in the run's folder. The
-    runs of a sweep or a curriculum form a group.
+    A resumed run goes on as the same run there: its id is kept in ``wandb-id.txt`` in the run's folder. But
+    what was logged offline cannot be continued: ``wandb sync`` of a part may replace what was sent of another
+    with the same id (wandb issues 3841, 5865). So each offline part, and what follows one, is a run of its
+    own, ``NAME part 2``, in one group with the others. The runs of a sweep or a curriculum form a group too.
     """
     # Imported here: it takes a second, and most runs do without.
     from lightning.pytorch.loggers import WandbLogger
 
     folder = Path(save_dir)
-    offline = "WANDB_MODE" not in os.environ and not _has_wandb_key()
-    if offline:
+    mode = os.environ.get("WANDB_MODE")
+    offline = mode in _OFFLINE or (mode is None and not _has_wandb_key())
+    if mode is None and offline:
         _log.info("no W&B key found: logging offline in %s (send it later with `wandb sync`)", folder)
     folder.mkdir(parents=True, exist_ok=True)
     group, job = group_and_job(folder)
+    ids = _ids_of_parts(folder, offline=offline)
+    if group is None and (offline or len(ids) > 1):
+        group = f"{folder.absolute().parent.name} {folder.absolute().name}"
+    part = f"part {len(ids)}" if len(ids) > 1 else ""
     return WandbLogger(
         project=project,
-        name=f"{name} {job}".strip(),
+        name=" ".join(word for word in (name, job, part) if word),
         group=group,
         save_dir=save_dir,
         offline=offline,
-        id=_kept_id(folder / WANDB_ID),
-        resume=None if offline else "allow",  # offline, `wandb sync` puts parts of one id together
+        id=ids[-1],
+        resume=None if offline else "allow",
     )
 
 
@@ -219,12 +229,19 @@ def group_and_job(folder: Path) -> tuple[str | None, str]:
     return f"{outermost.parent.name} {outermost.name}", folder.relative_to(outermost).as_posix()
 
 
-def _kept_id(path: Path) -> str:
-    """Return the id in a file; a new one, written there, where there is none."""
-    if not path.is_file():
-        # Only the first rank talks to W&B, so it does not matter whose id is kept if several begin at once.
-        write_text(path, secrets.token_hex(4) + "\n")
-    return path.read_text(encoding="utf-8").strip()
+def _ids_of_parts(folder: Path, *, offline: bool) -> list[str]:
+    """Return the ids of a run's parts, the last of them that to log with, and write down a new one.
+
+    An id is used again for a run that was online and is so now, and if nothing was logged with it yet.
+    """
+    path = folder / WANDB_ID
+    ids = path.read_text(encoding="utf-8").split() if path.is_file() else []
+    if ids and getattr(rank_zero_only, "rank", 0) != 0:
+        return ids  # only the first rank talks to W&B
+    if not ids or any(folder.glob(f"wandb/{'*' if offline else 'offline-'}run-*-{ids[-1]}")):
+        ids.append(secrets.token_hex(4))
+        write_text(path, "".join(f"{known}\n" for known in ids))
+    return ids
 
 
 def _has_wandb_key() -> bool:

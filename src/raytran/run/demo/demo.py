@@ -23,9 +23,10 @@ from raytran.data.files import SettingsRecord, write_json
 from raytran.errors import ConfigError
 from raytran.model import RayTran
 from raytran.run.demo.page import COLUMNS, ShownScene, headline, write_page
-from raytran.run.entry import compose, quoted
+from raytran.run.entry import compose
 from raytran.run.evaluate.evaluate import TASKS_WITH_SHAPE, about_data, evaluate_model
 from raytran.run.evaluate.results import write_evaluation
+from raytran.run.path_settings import quoted
 from raytran.run.predict.predict import predict_scene
 from raytran.run.predict.room import RoomViews
 from raytran.run.predict.write_scene import write_scene

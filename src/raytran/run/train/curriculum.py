@@ -16,7 +16,8 @@ from omegaconf import DictConfig
 from raytran.checkpoints.runs import LAST, read_finished, write_finished
 from raytran.data.files import SettingsRecord
 from raytran.errors import ConfigError, RaytranError
-from raytran.run.entry import compose, quoted, typed_config_dir, user_environment
+from raytran.run.entry import compose, typed_config_dir, typed_settings, user_environment
+from raytran.run.path_settings import quoted
 from raytran.run.train.fit import FitResult, train
 from raytran.training.callbacks.stop_signals import forward_signals
 
@@ -30,7 +31,7 @@ _OWN = ("stages", "output_dir", "resume")
 def curriculum(cfg: DictConfig) -> list[FitResult]:
     """Run ``python -m raytran.curriculum``: the overrides typed there hold for every stage."""
     overrides = [
-        item for item in HydraConfig.get().overrides.task if item.split("=")[0].lstrip("+~") not in _OWN
+        item for item in typed_settings(HydraConfig.get()) if item.split("=")[0].lstrip("+~") not in _OWN
     ]
     return run_curriculum(overrides, output_dir=Path(cfg.output_dir), stages=tuple(cfg.stages))
 
