@@ -15,6 +15,9 @@ SCAN = "scene0000_00"
 """The scan in the room of the tests."""
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""The +y up world of ARKit from the walk's."""
+
 MODEL_NUMBERS = {
     "PINHOLE": 1,
     "SIMPLE_RADIAL": 2,
@@ -123,6 +126,28 @@ def write_video(walk: Walk, path: Path, *, rate: int = 10, size=None) -> None:
             with Image.open(walk.folder / "images" / name) as image:
                 container.mux(stream.encode(av.VideoFrame.from_image(image.convert("RGB"))))
         container.mux(stream.encode())
+
+
+def write_stray(walk: Walk, folder: Path) -> Path:
+    """Write ``odometry.csv``, ``camera_matrix.csv`` and ``rgb/`` as Stray Scanner does, in ARKit's world."""
+    (folder / "rgb").mkdir(parents=True)
+    fx, fy, cx, cy = walk.camera
+    (folder / "camera_matrix.csv").write_text(f"{fx}, 0, {cx}\n0, {fy}, {cy}\n0, 0, 1\n")
+    rows = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
+    for n, (name, pose) in enumerate(zip(walk.names, Y_UP @ walk.poses, strict=True)):
+        turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        rows.append(", ".join([str(n / 60), f"{n:06d}", *words([*pose[:3, 3], *turn]).split()]))
+        (folder / "rgb" / f"{n:06d}.png").write_bytes((walk.folder / "images" / name).read_bytes())
+    (folder / "odometry.csv").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+def check_frames(scan, walk: Walk, numbers=None, *, turn=None) -> None:
+    """Hold the poses of a scan against the walk's, by the grey of each image, which tells its number."""
+    found = [round(float(scan.read_color(i)[24, 32, 0]) / 20) for i in range(len(scan))]
+    assert sorted(found) == sorted(range(len(walk.names)) if numbers is None else numbers)
+    poses = walk.poses[found] if turn is None else turn @ walk.poses[found]
+    np.testing.assert_allclose(scan.world_from_camera.numpy(), poses, atol=1e-6)
 
 
 def words(values) -> str:

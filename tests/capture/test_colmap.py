@@ -13,7 +13,7 @@ from raytran.capture.colmap import find_model, read_colmap
 from raytran.capture.recording import open_recording
 from raytran.errors import ConfigError, DataError
 
-from .forms import write_colmap
+from .forms import check_frames, write_colmap
 
 
 @pytest.mark.parametrize("binary", [True, False])
@@ -259,3 +259,130 @@ def test_a_focal_length_that_is_off_is_its_own(walk):
     assert scan.dropped == {}
     assert scan.intrinsics[:, 0, 0].tolist() == [56.0 if n == 6 else 50.0 for n in range(12)]
     assert all(scan.color_bytes(n) is not None for n in range(12))
+
+
+@pytest.mark.parametrize(
+    ("place", "images"),
+    [
+        ("sparse/0/models/1", "images"),
+        ("sparse/1", "images"),
+        ("dense/0/sparse", "dense/0/images"),
+        ("dense/sparse", "dense/images"),
+        ("colmap/sparse/0", "images"),
+        ("models/2", "images"),
+        ("0/sparse", "0/images"),
+    ],
+)
+@pytest.mark.parametrize("binary", [True, False])
+def test_models_and_images_where_programs_put_them(walk, place, images, binary):
+    few = replace(walk, names=walk.names[:2], poses=walk.poses[:2])
+    if place == "sparse/0/models/1":
+        write_colmap(few, walk.folder / "sparse" / "0", binary=binary)
+    write_colmap(walk, walk.folder / place, binary=binary)
+    if images != "images":
+        shutil.copytree(walk.folder / "images", walk.folder / images)
+        for path in (walk.folder / "images").iterdir():
+            path.write_bytes(b"distorted, so not of this model")
+    scan = open_recording(read_colmap(walk.folder))
+    assert (scan.scene_id, len(scan)) == ("walk", 12)
+    check_frames(scan, walk)
+
+
+def test_the_largest_model_is_that_of_most_images(walk):
+    few = replace(walk, names=walk.names[:2], poses=walk.poses[:2])
+    write_colmap(few, walk.folder / "sparse" / "0", binary=False)
+    # Observed points make a list long, not a model large.
+    listed = walk.folder / "sparse" / "0" / "images.txt"
+    listed.write_text(listed.read_text().replace("7\n", "7" + " 1.5 2.5 -1" * 5000 + "\n"))
+    write_colmap(walk, walk.folder / "sparse" / "1", binary=True)
+    assert len(read_colmap(walk.folder).frames) == 12
+    write_colmap(walk, walk.folder / "sparse" / ".ipynb_checkpoints", binary=True)
+    assert find_model(walk.folder) == walk.folder / "sparse" / "1"
+
+
+def test_text_without_its_empty_lines_loses_no_frame(walk):
+    write_colmap(walk, walk.folder / "sparse" / "0", binary=False)
+    listed = walk.folder / "sparse" / "0" / "images.txt"
+    lines = listed.read_text().splitlines()
+    for kept in (
+        [line for line in lines if line],  # only the empty ones are gone
+        [line for line in lines if line.endswith(".png")],
+        [line for line in lines if line.endswith(".png") or "7" in line][:-1],
+    ):
+        listed.write_text("\n".join(kept) + "\n")
+        check_frames(open_recording(read_colmap(walk.folder)), walk)
+
+
+def test_points_are_no_images_and_names_may_be_numbers(walk):
+    for n in range(12):
+        (walk.folder / "images" / f"{n}.png").rename(walk.folder / "images" / f"{n:04d}.png")
+    write_colmap(
+        replace(walk, names=tuple(f"{n:04d}" for n in range(12))), walk.folder / "sparse", binary=False
+    )
+    listed = walk.folder / "sparse" / "images.txt"
+    listed.write_text(listed.read_text().replace("1.5 2.5 -1 3.0 4.0 7", "15 25 -1 30 40 7 1 2 3 4 5 6"))
+    check_frames(open_recording(read_colmap(walk.folder)), walk)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+def test_text_of_windows_programs(walk, encoding):
+    write_colmap(walk, walk.folder / "sparse" / "0", binary=False)
+    for name in ("cameras.txt", "images.txt"):
+        path = walk.folder / "sparse" / "0" / name
+        path.write_text(path.read_text().partition("\n")[2].replace("\n", "\r\n"), encoding=encoding)
+    check_frames(open_recording(read_colmap(walk.folder)), walk)
+
+
+def test_a_model_of_a_windows_machine(walk, caplog):
+    caplog.set_level("INFO")
+    (walk.folder / "images" / "cam0").mkdir()
+    for name in walk.names:
+        (walk.folder / "images" / name).rename(walk.folder / "images" / "cam0" / name.replace(".png", ".PNG"))
+    moved = replace(walk, names=tuple(f"cam0\\{name}" for name in walk.names))
+    write_colmap(moved, walk.folder / "sparse" / "0", binary=True)
+    scan = open_recording(read_colmap(walk.folder))
+    assert scan.frame_id[11] == "cam0_11"
+    check_frames(scan, walk)
+    assert r"12 images were found under other spellings than it gives, e.g. cam0/11.PNG for cam0\11.png" in (
+        caplog.text
+    )
+
+
+def test_frames_of_two_folders_get_unlike_names(walk):
+    for folder in ("left_1", "left"):
+        (walk.folder / "images" / folder).mkdir()
+    names = tuple(f"left_1/{n // 2}.png" if n % 2 else f"left/1_{n // 2}.png" for n in range(12))
+    for old, new in zip(walk.names, names, strict=True):
+        (walk.folder / "images" / old).rename(walk.folder / "images" / new)
+    write_colmap(replace(walk, names=names), walk.folder / "sparse" / "0", binary=True)
+    scan = open_recording(read_colmap(walk.folder))
+    assert len({name.lower() for name in scan.frame_id}) == 12
+    check_frames(scan, walk)
+
+
+def test_damage_to_one_frame_leaves_that_one_out(walk):
+    write_colmap(walk, walk.folder / "sparse" / "0", binary=False, cameras=12)
+    cameras, images = (walk.folder / "sparse" / "0" / f"{name}.txt" for name in ("cameras", "images"))
+    lines = cameras.read_text().splitlines()
+    lines[3] = lines[3].replace("50.0", "-50.0")  # camera 3, of image 2
+    lines[5] = "5 PINHOLE wide"  # camera 5, of image 4
+    cameras.write_text("\n".join(lines))
+    rows = images.read_text().splitlines()
+    at = next(i for i, row in enumerate(rows) if row.endswith(" 7.png"))
+    rows[at] = rows[at].replace(rows[at].split()[2], "north")
+    images.write_text("\n".join(rows))
+    scan = open_recording(read_colmap(walk.folder))
+    assert scan.dropped == {
+        "2": "impossible intrinsics",
+        "4": "impossible intrinsics",
+        "7": "no pose",
+        f"line {at + 1}": "entry is damaged",
+    }
+    check_frames(scan, walk, [0, 1, 3, 5, 6, 8, 9, 10, 11])
+
+
+def test_typed_intrinsics_come_first(walk):
+    write_colmap(walk, walk.folder / "sparse" / "0", binary=True, model="OPENCV_FISHEYE", parameters=[9] * 8)
+    scan = open_recording(read_colmap(walk.folder, walk.camera))
+    assert scan.lens[3].focal == (50.0, 51.0)
+    check_frames(scan, walk)

@@ -7,6 +7,7 @@ import json
 import math
 import struct
 import zlib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,13 +15,13 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from raytran.capture.nerfstudio import read_nerfstudio
+from raytran.capture.nerfstudio import find_transforms, read_nerfstudio
 from raytran.capture.recording import open_recording
 from raytran.data.images import FILL
 from raytran.data.scan import scan_views
 from raytran.errors import DataError
 
-from .forms import OPENGL, transforms, write_transforms
+from .forms import OPENGL, check_frames, transforms, write_transforms
 
 
 def opened(walk, **changes):
@@ -312,3 +313,89 @@ def test_a_stray_picture_that_comes_first_does_not_say_the_size_of_all(walk):
     scan = open_recording(read_nerfstudio(walk.folder))
     assert scan.dropped == {"11": "image of another shape than its intrinsics are for"}
     assert (scan.image_size, scan.intrinsics[0, 0, 0].item()) == ((48, 64), pytest.approx(50))
+
+
+def test_entries_that_are_damaged_are_left_out(walk):
+    frames = transforms(walk)["frames"][::-1]
+    del frames[1]["transform_matrix"]
+    frames[2]["transform_matrix"][0][1] = "north"
+    frames[3]["fl_x"] = -1
+    frames[4]["transform_matrix"][0][3] = 1e300
+    frames[5] = "images/5.png"
+    frames[6]["file_path"] = 6
+    frames[7]["transform_matrix"] = [[1, 0], [0, 1]]
+    frames[8]["k1"] = "none"
+    scan = opened(walk, frames=frames)
+    matrix, lens = "no camera-to-world matrix of numbers", "impossible intrinsics"
+    assert scan.dropped == {
+        **dict.fromkeys(("1", "2", "7"), matrix),
+        **dict.fromkeys(("3", "8"), lens),
+        "4": "pose is not finite or out of bounds",
+        **dict.fromkeys(("frame 5", "frame 6"), "no image is named"),
+        **dict.fromkeys(("5", "6"), "no pose"),
+    }
+    scan = replace(scan, world_from_camera=scan.world_from_camera @ torch.from_numpy(OPENGL))
+    check_frames(scan, walk, [0, 9, 10, 11])
+
+
+@pytest.mark.parametrize("name", ["transforms_undistorted.json", "transforms.json"])
+def test_scannetpp(walk, name):
+    dslr = walk.folder / "scene" / "dslr"
+    folder = "resized_undistorted_images" if "undistorted" in name else "resized_images"
+    (dslr / "nerfstudio").mkdir(parents=True)
+    (walk.folder / "images").rename(dslr / folder)
+    frames = [
+        frame | {"file_path": frame["file_path"].removeprefix("images/"), "is_bad": n in (3, 11)}
+        for n, frame in enumerate(transforms(walk)["frames"][::-1])
+    ]
+    content = transforms(walk, frames=frames[:8], test_frames=frames[8:])
+    (dslr / "nerfstudio" / name).write_text(json.dumps(content))
+    for path in (walk.folder / "scene", dslr, dslr / "nerfstudio", dslr / "nerfstudio" / name):
+        scan = open_recording(read_nerfstudio(path))
+        assert scan.scene_id == "scene"
+        assert scan.dropped == {"3": "marked as bad", "11": "marked as bad"}
+        scan = replace(scan, world_from_camera=scan.world_from_camera @ torch.from_numpy(OPENGL))
+        check_frames(scan, walk, [n for n in range(12) if n not in (3, 11)])
+
+
+def test_undistorted_images_of_scannetpp_come_first_if_they_are_there(walk):
+    folder = walk.folder / "dslr" / "nerfstudio"
+    folder.mkdir(parents=True)
+    (walk.folder / "images").rename(walk.folder / "dslr" / "resized_images")
+    for name in ("transforms.json", "transforms_undistorted.json"):
+        (folder / name).write_text("{}")
+    assert find_transforms(walk.folder) == folder / "transforms.json"
+    (walk.folder / "dslr" / "resized_undistorted_images").mkdir()
+    assert find_transforms(walk.folder) == folder / "transforms_undistorted.json"
+
+
+def test_lists_for_training_validation_and_test_are_one_walk(walk):
+    frames = transforms(walk)["frames"]
+    for name, part in (("train", frames[:6]), ("val", frames[5:8]), ("test", frames[8:])):
+        content = transforms(walk, frames=part)
+        (walk.folder / f"transforms_{name}.json").write_text(json.dumps(content))
+    scan = open_recording(read_nerfstudio(walk.folder))
+    scan = replace(scan, world_from_camera=scan.world_from_camera @ torch.from_numpy(OPENGL))
+    check_frames(scan, walk)
+    # A list that is named is read alone.
+    assert len(read_nerfstudio(walk.folder / "transforms_train.json").frames) == 6
+
+
+def test_a_list_of_a_windows_machine(walk):
+    frames = transforms(walk)["frames"]
+    for frame in frames:
+        frame["file_path"] = "C:\\walk\\" + frame["file_path"].replace("/", "\\").replace(".png", ".PNG")
+    scan = opened(walk, frames=frames)
+    assert scan.frame_id[11] == "11"
+    scan = replace(scan, world_from_camera=scan.world_from_camera @ torch.from_numpy(OPENGL))
+    check_frames(scan, walk)
+
+
+def test_typed_intrinsics_fill_in_what_is_missing(walk):
+    path = write_transforms(walk)
+    content = {"frames": json.loads(path.read_text())["frames"]}
+    path.write_text(json.dumps(content))
+    scan = open_recording(read_nerfstudio(path, walk.camera))
+    assert scan.intrinsics.numpy()[..., [0, 1, 0, 1], [0, 1, 2, 2]].reshape(-1)[:4].tolist() == [*walk.camera]
+    with pytest.raises(DataError, match=r"frame 0 of .* has no fl_x"):
+        read_nerfstudio(path)

@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording: frames with poses and lenses as a reader of some format returns them, and the scan they make.
 
-What stands at the end, for names, image folders and JSON objects, trusts nothing that a file says.
+What stands at the end, for the numbers in JSON objects, trusts nothing that a file says.
 """
 
 from __future__ import annotations
 
 import logging
-import os
 from abc import ABC, abstractmethod
-from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -30,8 +29,8 @@ from raytran.capture.lens import (
     resample,
 )
 from raytran.data.images import box_within, decode_image, fill_up, has_shape, is_turned, stored_size
-from raytran.data.scan import LOST, NO_IMAGE, NO_POSE, OTHER_SHAPE, TURNED, OpenScan, numbers_first
-from raytran.data.scannet.text import are_rigid
+from raytran.data.scan import NO_IMAGE, OTHER_SHAPE, TURNED, OpenScan, none_usable, numbers_first
+from raytran.data.scannet.text import pose_faults
 from raytran.errors import DataError
 from raytran.geometry.camera import is_off_center
 from raytran.limits import Quantity, as_number, as_numbers
@@ -42,9 +41,12 @@ Axes = Literal["opencv", "opengl"]
 """Axes of a camera: x right, y down, z forward; or x right, y up, z backward."""
 
 UNREADABLE = "image cannot be read"
-"""Reason for which a frame is dropped, beside those of ``raytran.data.scan``."""
+NO_LENS = "impossible intrinsics"
+NO_ENTRY = "entry is damaged"
+"""Reasons for which a frame is dropped, beside those of ``raytran.data.scan``."""
 
-IMAGE_ENDINGS = (".jpg", ".jpeg", ".png")
+Intrinsics = tuple[float, float, float, float]
+"""fx, fy, cx, cy of the stored images, pixels, as a user types them."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +89,39 @@ class Recording:
     up: tuple[float, float, float] | None = None
     metric: bool = False
     dropped: dict[str, str] = field(default_factory=dict)
+
+
+class FrameList:
+    """Collects the frames of a recording; damage to the entry of one leaves that one out, with the reason.
+
+    Attributes:
+        frames: collected so far.
+        dropped: reason for each frame that was left out.
+    """
+
+    def __init__(self, dropped: Mapping[str, str] | None = None) -> None:
+        self.frames: list[Frame] = []
+        self.dropped: dict[str, str] = dict(dropped or {})
+        self._first: DataError | None = None
+
+    @contextmanager
+    def sparing(self, name: str, reason: str) -> Iterator[None]:
+        """Leave a frame out, for a reason, if its part of a file turns out to be damaged."""
+        try:
+            yield
+        except DataError as error:
+            self.dropped[name] = reason
+            self._first = self._first or error
+
+    def checked(self) -> tuple[Frame, ...]:
+        """Return the frames.
+
+        Raises:
+            DataError: all of them are damaged; it is the error of the first.
+        """
+        if not self.frames and self._first is not None:
+            raise self._first
+        return tuple(self.frames)
 
 
 class FrameImages(ABC):
@@ -287,9 +322,9 @@ def _usable(
     frames: list[Frame] = []
     lenses: list[Lens] = []
     ordered = sorted(recording.frames, key=lambda frame: numbers_first(frame.name))
-    rigid = are_rigid(np.array([frame.world_from_camera for frame in ordered]).reshape(-1, 4, 4))
-    for frame, is_rigid in zip(ordered, rigid.tolist(), strict=True):
-        size = size_of(frame) if is_rigid else LOST
+    faults = pose_faults(np.array([frame.world_from_camera for frame in ordered]).reshape(-1, 4, 4))
+    for frame, fault in zip(ordered, faults, strict=True):
+        size = size_of(frame) if fault is None else fault
         if isinstance(size, str):
             dropped[frame.name] = size
             continue
@@ -299,24 +334,22 @@ def _usable(
         except UnfitLens as error:
             unfit[frame.name] = error
     # Where most images have it there, a principal point far from the middle is a mistake.
-    faults = [
+    off_center = [
         center_fault(lens, _camera_of(frame, recording.path))
         for frame, lens in zip(frames, lenses, strict=True)
     ]
-    if sum(fault is not None for fault in faults) > len(frames) / 2:
-        unfit |= {frame.name: fault for frame, fault in zip(frames, faults, strict=True) if fault is not None}
-        lenses = [lens for lens, fault in zip(lenses, faults, strict=True) if fault is None]
-        frames = [frame for frame, fault in zip(frames, faults, strict=True) if fault is None]
+    if sum(fault is not None for fault in off_center) > len(frames) / 2:
+        unfit |= {
+            frame.name: fault for frame, fault in zip(frames, off_center, strict=True) if fault is not None
+        }
+        lenses = [lens for lens, fault in zip(lenses, off_center, strict=True) if fault is None]
+        frames = [frame for frame, fault in zip(frames, off_center, strict=True) if fault is None]
     dropped |= {name: error.reason for name, error in unfit.items()}
     if frames:
         return frames, lenses, dropped
     if len(unfit) > len(dropped) / 2:
         raise next(iter(unfit.values()))
-    reasons = ", ".join(f"{count} {reason}" for reason, count in Counter(dropped.values()).most_common())
-    raise DataError(
-        f"none of the {len(dropped)} frames of {recording.path} has an image and a valid pose "
-        f"({reasons}): check that its images lie beside it under the names it gives"
-    )
+    raise none_usable(recording.path, dropped)
 
 
 def _lens_for_size(frame: Frame, size: tuple[int, int], listed_in: Path) -> Lens:
@@ -342,49 +375,14 @@ def _camera_of(frame: Frame, listed_in: Path) -> str:
     return f"the camera of {frame.name} in {listed_in}"
 
 
-def frame_name(image: str) -> str:
-    """Return the name of a frame from its image's path in a folder, without ``images/`` and ending.
-
-    Folders are joined by an underscore, so that it may serve as a file name.
-    """
-    return str(PurePosixPath(image).with_suffix("")).removeprefix("images/").replace("/", "_")
-
-
-def images_in(folder: Path) -> list[Path]:
-    """Return the JPEG and PNG files in a folder, in the order of the numbers in their names."""
-    images = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_ENDINGS]
-    return sorted(images, key=lambda path: numbers_first(path.name))
-
-
-def unposed_images(frames: Sequence[Frame], root: Path) -> dict[str, str]:
-    """Return the images in the folders of some frames that belong to none of them, with the reason.
-
-    Args:
-        frames: with images below ``root``.
-        root: folder from which frames are named.
-    """
-    folders = {frame.image.parent for frame in frames}
-    images = {path for folder in folders if folder.is_dir() for path in images_in(folder)}
-    without_pose = images - {frame.image for frame in frames}
-    names = (path.relative_to(os.path.abspath(root)).as_posix() for path in without_pose)
-    return {frame_name(name): NO_POSE for name in names}
-
-
-def path_inside(folder: Path, name: str, listed_in: Path) -> Path:
-    """Return the path of a file that a list names.
+def typed_lens(intrinsics: Intrinsics, size: tuple[int, int]) -> Lens:
+    """Return the lens that a user typed for images of a stored size ``(H, W)``.
 
     Raises:
-        DataError: the name leads out of the folder; a list from a stranger must not have files read that
-            lie elsewhere.
+        DataError: no lens of such images has such intrinsics.
     """
-    root = os.path.abspath(folder)
-    path = os.path.abspath(os.path.join(root, name)) if "\0" not in name else ""
-    if not path.startswith(root + os.sep):
-        raise DataError(
-            f"{listed_in} names the image {name[:200]!r}, which is outside {folder}: "
-            "move the images there and write relative paths"
-        )
-    return Path(path)
+    fx, fy, cx, cy = intrinsics
+    return check_lens(Lens(size, (fx, fy), (cx, cy)), f"intrinsics={fx:g},{fy:g},{cx:g},{cy:g}")
 
 
 def number(

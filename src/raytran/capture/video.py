@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import importlib
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from raytran.capture.recording import Frame, FrameImages, RecordedScan, Recording, build_scan
+from raytran.capture.names import is_hidden
+from raytran.capture.recording import (
+    Frame,
+    FrameImages,
+    Intrinsics,
+    RecordedScan,
+    Recording,
+    build_scan,
+    typed_lens,
+)
 from raytran.capture.trajectory import (
     INTRINSICS_NAMES,
     TRACK_NAMES,
@@ -24,6 +34,8 @@ from raytran.data.images import resize
 from raytran.data.scan import NO_POSE
 from raytran.errors import ConfigError, DataError
 from raytran.limits import MAX_SIDE
+
+_log = logging.getLogger(__name__)
 
 VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
 
@@ -152,17 +164,20 @@ def find_video(path: Path) -> Path | None:
     """Return the video that ``path`` is, or the only one in that folder; None if there is none or several."""
     if path.is_file():
         return path if path.suffix.lower() in VIDEO_ENDINGS else None
-    videos = (
-        [child for child in path.iterdir() if child.suffix.lower() in VIDEO_ENDINGS] if path.is_dir() else []
-    )
+    children = [child for child in path.iterdir() if not is_hidden(child.name)] if path.is_dir() else []
+    videos = [child for child in children if child.suffix.lower() in VIDEO_ENDINGS]
     return videos[0] if len(videos) == 1 else None
 
 
-def read_video(path: Path) -> Recording:
+def read_video(path: Path, intrinsics: Intrinsics | None = None) -> Recording:
     """Read the poses of a video's frames.
 
     Beside ``walk.mp4`` lie its poses, ``walk.txt`` or ``trajectory.txt``, and ``walk.intrinsics.txt`` or
     ``intrinsics.txt``. Times are seconds since the first frame; poses without times are one per frame.
+
+    Args:
+        path: the video, or the folder that holds no other.
+        intrinsics: of the stored frames, in place of those in a file.
 
     Raises:
         DataError: a part is missing or damaged, or poses and frames are of other numbers or times.
@@ -171,13 +186,16 @@ def read_video(path: Path) -> Recording:
     if video is None:
         raise DataError(f"{path} is or holds no single video ({', '.join(VIDEO_ENDINGS)}): give its path")
     track = read_track(_beside(video, (f"{video.stem}.txt", f"{video.stem}.tum", *TRACK_NAMES), "pose track"))
-    listed = _beside(video, (f"{video.stem}.intrinsics.txt", *INTRINSICS_NAMES), "intrinsics")
     file = VideoFile(video)
     try:
         times, image_size = file.times, file.image_size
     finally:
         file.close()
-    lens = read_camera(listed, image_size)
+    if intrinsics is None:
+        listed = _beside(video, (f"{video.stem}.intrinsics.txt", *INTRINSICS_NAMES), "intrinsics")
+        lens = read_camera(listed, image_size)
+    else:
+        lens = typed_lens(intrinsics, image_size)
     poses = _poses(track, times, video)
     has_pose = [bool(np.isfinite(pose).all()) for pose in poses]
     return Recording(
@@ -209,12 +227,17 @@ def open_video(recording: Recording) -> RecordedScan:
 def _poses(track: Track, times: NDArray[np.float64], video: Path) -> NDArray[np.float64]:
     """Return the pose of each frame, ``(n, 4, 4)``; not finite where there is none."""
     if track.times is None:
-        if len(track) != len(times):
+        if abs(len(track) - len(times)) > 1:
             raise DataError(
                 f"{video} has {len(times)} frames and {track.path.name} {len(track)} poses without times: "
                 "give one per frame, or a timestamp with each (`timestamp tx ty tz qx qy qz qw`)"
             )
-        return track.world_from_camera
+        if len(track) != len(times):
+            # Frames and poses are in the order of time, and recordings are cut at their end.
+            more = "pose" if len(track) > len(times) else "frame"
+            _log.warning("%s: the last %s has no partner and is left out", video, more)
+        lost = np.full((1, 4, 4), np.nan)
+        return np.concatenate([track.world_from_camera, lost])[: len(times)]
     poses = poses_at(track, times)
     if not np.isfinite(poses).all(axis=(1, 2)).any():
         raise DataError(
@@ -229,7 +252,10 @@ def _beside(video: Path, names: tuple[str, ...], what: str) -> Path:
     path = next((video.with_name(name) for name in names if video.with_name(name).is_file()), None)
     if path is None:
         form = "`timestamp tx ty tz qx qy qz qw` lines" if what == "pose track" else "`fx fy cx cy`"
-        raise DataError(f"{video} has no {what} beside it: write {form} to {video.with_name(names[0])}")
+        typed = "" if what == "pose track" else ", or give intrinsics=fx,fy,cx,cy"
+        raise DataError(
+            f"{video} has no {what} beside it: write {form} to {video.with_name(names[0]).name}{typed}"
+        )
     return path
 
 

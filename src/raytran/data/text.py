@@ -58,7 +58,7 @@ def read_table(path: Path, *, max_bytes: int = MAX_BYTES) -> NDArray[np.float64]
             each.
     """
     lines = read_text(path, max_bytes=max_bytes).splitlines()
-    rows = [line.partition("#")[0].translate(_PARTED).split() for line in lines]
+    rows = [parted(line) for line in lines]
     try:
         return np.array([[float(word) for word in row] for row in rows if row], dtype=np.float64)
     except ValueError as error:
@@ -66,6 +66,11 @@ def read_table(path: Path, *, max_bytes: int = MAX_BYTES) -> NDArray[np.float64]
         raise DataError(
             f"line {number} of {path} does not hold numbers, as many as the other lines do: mend it"
         ) from error
+
+
+def parted(line: str) -> list[str]:
+    """Return the words of a line that are parted by blanks, commas or semicolons, without a comment."""
+    return line.partition("#")[0].translate(_PARTED).split()
 
 
 _PARTED = str.maketrans(",;", "  ")

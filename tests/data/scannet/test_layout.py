@@ -47,7 +47,7 @@ def test_lost_poses_and_missing_files_in_every_form(scan_in_form, tmp_path, form
     poses[names[1]].unlink()
     images[names[2]].unlink()
     assert read_scan(folder).dropped == {
-        names[0]: "pose is not finite or no rigid motion",
+        names[0]: "pose is not finite or out of bounds",
         names[1]: "no pose",
         names[2]: "no image",
     }

@@ -11,8 +11,9 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from raytran.capture.open import open_scene
+from raytran.capture.open import open_scene, parse_intrinsics
 from raytran.capture.orientation import WorldSettings
+from raytran.capture.recording import Intrinsics
 from raytran.checkpoints.load import PredictionSettings, load_model, prediction_settings
 from raytran.checkpoints.network import trusted_packages
 from raytran.data.shapenet.models import shapenet_version
@@ -63,6 +64,7 @@ def predict(cfg: DictConfig) -> Path:
     """
     recording, output = Path(cfg.scene).resolve(), Path(cfg.output)
     world = WorldSettings(up=cfg.up, scale=cfg.scale, convention=cfg.convention, check=cfg.check)
+    intrinsics = parse_intrinsics(cfg.intrinsics)
     check_choice(cfg.frames, cfg.num_views)
     check_pictures(num_overlays=cfg.num_overlays, turntable=cfg.turntable)
     check_replaceable(output.resolve(), marker=MARKER)
@@ -79,7 +81,7 @@ def predict(cfg: DictConfig) -> Path:
     new_cameras = cameras_to_render(cfg.views, model, cfg.checkpoint)
     scene_id = recording.stem if recording.is_file() else recording.name
     truth = read_truth(Path(cfg.truth), scene_id) if cfg.truth else None
-    room = _read_room(cfg, world, settings, model)
+    room = _read_room(cfg, world, intrinsics, settings, model)
     scene = predict_scene(
         model,
         room,
@@ -192,10 +194,15 @@ def predict_room(
 
 
 def _read_room(
-    cfg: DictConfig, world: WorldSettings, settings: PredictionSettings, model: RayTran
+    cfg: DictConfig,
+    world: WorldSettings,
+    intrinsics: Intrinsics | None,
+    settings: PredictionSettings,
+    model: RayTran,
 ) -> RoomViews:
     """Return the frames that the network is given, and its volumes."""
-    with open_scene(Path(cfg.scene).resolve(), format=cfg.format, settings=world) as scan:
+    scene = Path(cfg.scene).resolve()
+    with open_scene(scene, format=cfg.format, settings=world, intrinsics=intrinsics) as scan:
         return read_room(
             scan,
             frames=cfg.frames,
