@@ -46,6 +46,7 @@ from raytran.capture.recording import (
 from raytran.data.images import stored_size
 from raytran.errors import DataError
 from raytran.geometry.rotation import matrix_from_quaternion
+from raytran.limits import FOCAL_LENGTH
 
 _log = logging.getLogger(__name__)
 
@@ -63,6 +64,9 @@ _PARTS_OF_PLACES = ("0", "sparse", "dense", "models", "colmap")
 _MAX_NAME = 4096
 _MAX_LINE = 1 << 24
 """Characters of a line of text that are looked at: observed points are not needed."""
+
+_LARGEST_SIZE = 1 << 31
+"""Larger sizes of images no camera has; those that are too large to be read are told so."""
 
 _IMAGE_BYTES = 64
 """Bytes of an image in ``images.bin``, at least."""
@@ -266,18 +270,29 @@ def _cameras_text(path: Path) -> dict[int, Lens | DataError]:
             camera = int(number)
             size = (int(height), int(width))
             values = [float(value) for value in params]
+            if max(size) > _LARGEST_SIZE:
+                raise ValueError("its size is none")
         except ValueError as error:
             broken = broken or DataError(
                 f"line {row} of {path} is no camera ({str(error)[:80]}): export the model again"
             )
             continue
-        try:
-            cameras[camera] = colmap_lens(model, size, values, f"camera {camera} in {path}")
-        except DataError as error:
-            cameras[camera] = error
+        cameras[camera] = _lens_or_fault(model, size, values, f"camera {camera} in {path}")
     if broken is not None and not any(isinstance(lens, Lens) for lens in cameras.values()):
         raise broken
     return cameras
+
+
+def _lens_or_fault(
+    model: str | int, size: tuple[int, int], params: Sequence[float], where: str
+) -> Lens | DataError:
+    """Return the lens of a camera, or what is wrong with it."""
+    if not all(abs(value) <= FOCAL_LENGTH.high for value in params):  # not-a-number is not
+        return DataError(f"{where} has parameters that no lens has: export the model again")
+    try:
+        return colmap_lens(model, size, params, where)
+    except DataError as error:
+        return error
 
 
 def _images_text(path: Path, collected: FrameList) -> list[_Image]:
@@ -354,10 +369,7 @@ def _cameras_binary(path: Path) -> dict[int, Lens | DataError]:
             where = f"camera {number} in {path}"
             layout = f"<{lens_model(model, where).num_params}d"
             params = struct.unpack_from(layout, data, at + 24)
-            try:
-                cameras[number] = colmap_lens(model, (height, width), params, where)
-            except DataError as error:
-                cameras[number] = error
+            cameras[number] = _lens_or_fault(model, (height, width), params, where)
             at += 24 + struct.calcsize(layout)
     return cameras
 

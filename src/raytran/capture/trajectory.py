@@ -249,6 +249,8 @@ def read_camera(path: Path, image_size: tuple[int, int]) -> Lens:
     if path.suffix == ".json":
         return _replica_lens(path)
     values = read_table(path)
+    if not (np.abs(values) <= FOCAL_LENGTH.high).all():  # not-a-number is not
+        raise DataError(f"{path} holds numbers that are no pixels: write `fx fy cx cy` of the stored images")
     if values.shape in ((3, 3), (4, 4)):
         focal, center = (values[0, 0], values[1, 1]), (values[0, 2], values[1, 2])
         return check_lens(Lens(image_size, focal, center), str(path))

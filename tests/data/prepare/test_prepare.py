@@ -81,7 +81,7 @@ def test_recordings_are_read_and_one_that_ends_early_is_named(released, prepare,
     path.write_bytes(path.read_bytes()[:-2500])
     report = prepare(released, tmp_path / "out", settings=PrepareSettings((32, 48), max_frames=None)).report
     assert report["frames"]["forms"] == {"exporter": 1, "sens": 2}
-    assert report["frames"]["dropped"]["pose is not finite or no rigid motion"] == 2
+    assert report["frames"]["dropped"]["pose is not finite or out of bounds"] == 2
     (cut,) = report["noticed"]["recordings_cut_short"].items()
     assert cut[0] == "scene0001_00"
     assert "ends after 5 of the 8 frames" in cut[1]

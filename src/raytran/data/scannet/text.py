@@ -16,7 +16,7 @@ from raytran.data.text import read_table
 from raytran.errors import DataError
 from raytran.geometry.camera import FARTHEST_CENTER, center_offset, other_image_size
 from raytran.geometry.checks import rigid_motions
-from raytran.limits import POSITION
+from raytran.limits import FOCAL_LENGTH, POSITION
 
 INFO_FILES = ("_info.txt", "info.txt")
 """Names of the C++ exporter's file of facts."""
@@ -178,7 +178,8 @@ def check_intrinsics(
     Raises:
         DataError: they are not finite, not positive, or for another image size.
     """
-    if not np.isfinite(matrix).all() or min(matrix[0, 0], matrix[1, 1]) <= 0:
+    is_pixels = (np.abs(matrix) <= FOCAL_LENGTH.high).all()  # not-a-number is not
+    if not is_pixels or min(matrix[0, 0], matrix[1, 1]) <= 0:
         raise DataError(
             f"{path} does not hold a camera matrix with positive focal lengths: "
             "write fx, fy, cx, cy of the stored colour images there as 4x4"
