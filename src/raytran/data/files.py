@@ -22,6 +22,7 @@ from typing import Any
 from uuid import uuid4
 
 from raytran.data.locks import Process
+from raytran.errors import DataError
 
 UNFINISHED = ".unfinished-"
 """Start of every temporary name; the process that writes there follows."""
@@ -128,6 +129,9 @@ def finished_folder(folder: Path, *, replace: bool = False) -> Iterator[Path]:
         folder: the final name; folders above it are made.
         replace: a folder that is there already is replaced; of several processes the last one wins. Otherwise
             it stays: another process has finished the same work meanwhile.
+
+    Raises:
+        DataError: the folder above was removed meanwhile.
     """
     sibling = folder.with_name(unfinished_name())
     try:
@@ -139,6 +143,12 @@ def finished_folder(folder: Path, *, replace: bool = False) -> Iterator[Path]:
                 break
             with contextlib.suppress(FileNotFoundError):  # another process has put it aside
                 os.replace(folder, sibling / uuid4().hex)
+    except FileNotFoundError as error:
+        if sibling.is_dir():
+            raise
+        raise DataError(
+            f"{folder.parent} was removed while {folder.name} was written: start again"
+        ) from error
     finally:
         shutil.rmtree(sibling, ignore_errors=True)
 

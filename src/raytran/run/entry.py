@@ -20,7 +20,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from raytran.checkpoints.runs import STAGE_NAMES, first_ranks, run_folder
-from raytran.errors import ConfigError, RaytranError
+from raytran.data.files import disk_full
+from raytran.errors import ConfigError, DataError, RaytranError
 from raytran.run.config_dir import config_dir
 from raytran.run.sweep.folder import register_sweep_resolver
 
@@ -161,6 +162,14 @@ def run_or_exit(function: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
         raise
     except OmegaConfBaseException as error:
         _exit_with(ConfigError(f"{str(error).splitlines()[0]} (see --cfg job for all settings)"))
+    except Exception as error:
+        full = disk_full(error)
+        if full is None:
+            raise
+        place = f"write {full.filename}" if full.filename else "go on writing"
+        _exit_with(
+            DataError(f"cannot {place} ({full.strerror}): make room there, then give the command again")
+        )
 
 
 def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:

@@ -14,6 +14,7 @@ from raytran.errors import ConfigError, DataError
 from raytran.pictures import accuracy_curves
 from raytran.run.entry import compose
 from raytran.run.evaluate.evaluate import evaluate
+from raytran.run.output import one_writer
 
 CHAIR, TABLE, SOFA, LAMP = "03001627", "04379243", "04256520", "03636649"
 UPRIGHT = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
@@ -381,6 +382,15 @@ def test_bad_settings(files):
         run(files, predictions="empty")
     with pytest.raises(ConfigError, match="no earlier result"):
         run(files, output="csv")
+
+
+def test_two_evaluations_into_one_folder(files):
+    with (
+        one_writer(files / "out", marker="metrics.json"),
+        pytest.raises(ConfigError, match=r"another process writes .*out \(number"),
+    ):
+        run(files, output="out")
+    assert not (files / "out").exists()
 
 
 def test_the_command_ends_with_one_sentence(files, command):

@@ -13,7 +13,7 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from raytran.checkpoints.runs import LAST, read_finished, write_finished
+from raytran.checkpoints.runs import LAST, one_at_a_time, read_finished, write_finished
 from raytran.data.files import SettingsRecord
 from raytran.errors import ConfigError, RaytranError
 from raytran.run.entry import compose, quoted, typed_config_dir, user_environment
@@ -57,7 +57,15 @@ def run_curriculum(
     presets = [
         compose("train", [*overrides, f"experiment={name}", "output_dir=none"]).preset for name in stages
     ]
-    _record(output_dir, overrides, stages)
+    with one_at_a_time(output_dir):
+        _record(output_dir, overrides, stages)
+        return _train_stages(overrides, output_dir, stages, presets)
+
+
+def _train_stages(
+    overrides: Sequence[str], output_dir: Path, stages: Sequence[str], presets: Sequence[str]
+) -> list[FitResult]:
+    """Train the stages that have not finished."""
     results: list[FitResult] = []
     for number, experiment in enumerate(stages, start=1):
         _log.info("stage %d of %d: experiment=%s", number, len(stages), experiment)
