@@ -80,7 +80,7 @@ def test_on_a_full_disk_the_folder_is_whole_or_as_it_was(tmp_path, found, views)
     for size in sorted(sizes):
         resource.setrlimit(resource.RLIMIT_FSIZE, (size - 1, hard))
         try:
-            with pytest.raises(OSError, match="File too large|encoder error") as raised:
+            with pytest.raises(OSError, match=r"File too large|encoder error") as raised:
                 write(tmp_path / "room", found, views, turntable=1)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
