@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import random
 
 import pytest
 from PIL import Image
@@ -382,6 +383,27 @@ def test_bad_settings(files):
         run(files, predictions="empty")
     with pytest.raises(ConfigError, match="no earlier result"):
         run(files, output="csv")
+
+
+@pytest.mark.parametrize("spread", [0.0, 30.0])
+def test_one_file_of_many_rows_needs_memory_by_rows(files, command, spread):
+    """A table of all pairs of 5,000 rows took 29 GB; here are 1.5 GB beyond what torch itself maps."""
+    rng = random.Random(0)
+    rows = [
+        row(CHAIR, "c1", (rng.uniform(0, spread), rng.uniform(0, spread), 0), rng.choice([UPRIGHT, TURNED]))
+        for _ in range(5000)
+    ]
+    (files / "csv" / "a.csv").write_text("".join([ROWS[1], *rows]))
+    limit = (
+        "import resource; mapped = int(open('/proc/self/statm').read().split()[0]) * 4096;"
+        "resource.setrlimit(resource.RLIMIT_AS, (mapped + 3 * 2**29,) * 2)"
+    )
+    settings = ["predictions=csv", "annotations=annotations.json", "output=out", "num_resamples=10"]
+    done = command("evaluate", *settings, "protocol=all", folder=files, first=limit)
+    assert done.returncode == 0, done.stderr
+    found = json.loads((files / "out" / "metrics.json").read_text())
+    assert {"strict", "scan2cad", "vid2cad", "odam"} <= found.keys()
+    assert found["strict"]["per_class"]["table"]["n_good"] == 1
 
 
 def test_two_evaluations_into_one_folder(files):
