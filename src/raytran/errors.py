@@ -3,14 +3,28 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 
+_FROM_A_WORKER = re.compile(r"Caught \w+ in DataLoader worker process \d+\.\n")
+
+
 class RaytranError(Exception):
-    """Base of all errors that are the user's to mend; commands print it as one sentence and exit with 1."""
+    """Base of all errors that are the user's to mend; commands print it as one sentence and exit with 1.
+
+    A loader makes an error of one of its worker processes anew, with the worker's traceback as the message:
+    what counts is the sentence at the end of that.
+    """
+
+    def __init__(self, message: object = "") -> None:
+        text = str(message)
+        if _FROM_A_WORKER.match(text):
+            text = text.rstrip().splitlines()[-1].partition(": ")[2] or text
+        super().__init__(text)
 
 
 class ConfigError(RaytranError):

@@ -21,6 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from raytran.checkpoints.runs import STAGE_NAMES, first_ranks, run_folder
 from raytran.data.files import disk_full
+from raytran.data.workers import ENDS_WITH, end_with_parent
 from raytran.errors import ConfigError, DataError, RaytranError
 from raytran.run.config_dir import config_dir
 from raytran.run.sweep.folder import register_sweep_resolver
@@ -53,6 +54,11 @@ _WITH_VALUE = {
     *("--cfg", "-c", "--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn", "--info", "-i"),
 }
 """Hydra's options that a word of their own may follow."""
+
+_STARTER_ENDED = (
+    "the process that started this one has ended: it said why, or it was killed; give the same command "
+    "again, with resume=auto to go on with a run"
+)
 
 _TYPED_FULL_ERROR = os.environ.get(_FULL_ERROR)
 
@@ -88,6 +94,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
 
 def _compose_or_exit(command: Callable[[], Any], typed: str | None) -> Any:
     """Run a command; a setting that does not exist becomes a sentence instead of Hydra's paragraph."""
+    _end_with_starter()
     _set_full_error("1")  # Hydra then raises instead of printing; the task restores what the user has set
     try:
         return command()
@@ -110,6 +117,15 @@ def _compose_or_exit(command: Callable[[], Any], typed: str | None) -> Any:
         _set_full_error(typed)
         # A resolver of ours that objects is wrapped by OmegaConf; its message is the clearer one.
         _exit_with(ConfigError(_first_line(error).split("resolving interpolation: ")[-1]))
+
+
+def _end_with_starter() -> None:
+    """End with the process that has started this command as a part of itself, if one has."""
+    starter = os.environ.pop(ENDS_WITH, None)
+    if starter is not None and starter.isdecimal():
+        end_with_parent(_STARTER_ENDED, parent=int(starter))
+    elif "TORCHELASTIC_RUN_ID" in os.environ:
+        end_with_parent(_STARTER_ENDED)
 
 
 def _no_such_setting(error: ConfigCompositionException, typed: Sequence[str]) -> ConfigError:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from omegaconf import DictConfig
 
 from raytran.checkpoints.runs import LAST, one_at_a_time, read_finished, write_finished
 from raytran.data.files import SettingsRecord
+from raytran.data.workers import ENDS_WITH
 from raytran.errors import ConfigError, RaytranError
 from raytran.run.entry import compose, quoted, typed_config_dir, user_environment
 from raytran.run.train.fit import FitResult, train
@@ -111,7 +113,7 @@ def _config_dir() -> list[str]:
 def _run(command: Sequence[str]) -> int:
     """Run a command and return its exit code; forward signals to it, and stop after it if one came."""
     stopped_by = 0
-    with subprocess.Popen(command, env=user_environment()) as process:
+    with subprocess.Popen(command, env=user_environment() | {ENDS_WITH: str(os.getpid())}) as process:
 
         def stop(signum: int) -> None:
             nonlocal stopped_by
