@@ -71,9 +71,7 @@ def rank_processes(trainer: pl.Trainer) -> Iterator[None]:
         explained = _explained(trainer, error)
         if isinstance(explained, LostRankError) and trainer.global_rank > 0:
             _leave_the_word_to_the_first_rank()
-        for process in _started(trainer):
-            with contextlib.suppress(OSError):
-                process.kill()
+        _kill(_started(trainer))
         if explained is None:
             raise
         raise explained from error
@@ -107,9 +105,7 @@ def _watch(trainer: pl.Trainer, ended: threading.Event) -> None:
         _take_over_from_lightning()
         if any(process.poll() for process in started):
             if not ended.wait(_GRACE_SECONDS):  # it waits for the lost rank, perhaps for long
-                for process in started:
-                    with contextlib.suppress(OSError):
-                        process.kill()
+                _kill(started)
                 end_now(_LOST)
             return
 
@@ -127,6 +123,13 @@ def _wait_for(processes: list[subprocess.Popen[bytes]]) -> None:
     for process in processes:
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(max(0.0, deadline - time.monotonic()))
+
+
+def _kill(processes: list[subprocess.Popen[bytes]]) -> None:
+    for process in processes:
+        with contextlib.suppress(OSError):
+            process.kill()
+    _wait_for(processes)
 
 
 def _leave_the_word_to_the_first_rank() -> None:
