@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -15,13 +16,24 @@ LONGEST = 290
 _KEPT_OF_WORDS = (40, 20)
 """Characters that the longest words keep: so many first, so many if that does not do."""
 
+_FROM_A_WORKER = re.compile(r"Caught \w+ in DataLoader worker process \d+\.\n")
+
 
 class RaytranError(Exception):
     """Base of all errors that are the user's to mend; commands print it as one sentence and exit with 1.
 
     Its ``str`` is one line of at most ``LONGEST`` characters, whatever a file or a command line has put into
     it; ``args`` hold what was given.
+
+    A loader makes an error of one of its worker processes anew, with the worker's traceback as the message:
+    what counts is the sentence at the end of that.
     """
+
+    def __init__(self, message: object = "") -> None:
+        text = str(message)
+        if _FROM_A_WORKER.match(text):
+            text = text.rstrip().splitlines()[-1].partition(": ")[2] or text
+        super().__init__(text)
 
     def __str__(self) -> str:
         return one_line(super().__str__())

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import errno
+import os
 import subprocess
 import sys
 
@@ -38,6 +40,18 @@ def test_a_missing_setting_is_one_sentence(capsys):
     with pytest.raises(SystemExit):
         run_or_exit(lambda cfg: cfg.checkpoint, OmegaConf.create({"checkpoint": "???"}))
     assert "checkpoint" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG])
+def test_a_full_disk_is_one_sentence(capsys, number):
+    wrapped = ValueError("cannot encode")
+    wrapped.__cause__ = OSError(number, os.strerror(number), "out/a.png")
+    for error in (wrapped, wrapped.__cause__):
+        with pytest.raises(SystemExit) as stop:
+            run_or_exit(raise_error(error), OmegaConf.create())
+        assert stop.value.code == 1
+        (sentence,) = capsys.readouterr().err.splitlines()
+        assert sentence.startswith(f"raytran: cannot write out/a.png ({os.strerror(number)}): make room")
 
 
 def test_a_defect_keeps_its_traceback():

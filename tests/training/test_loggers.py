@@ -2,6 +2,8 @@
 from __future__ import annotations
 
 import csv
+import resource
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -82,6 +84,61 @@ def test_a_full_disk_delays_rows(path, monkeypatch, caplog):
     assert caplog.text.count("No space left on device): make room there; training goes on") == 1
     log(table, (3, {"a": 4.0}))
     assert read_history(path.parent)["a"] == [(0, 1.0), (1, 2.0), (2, 3.0), (3, 4.0)]
+
+
+@contextmanager
+def largest_file(size):
+    """Refuse to let a file grow beyond a size, in the middle of a write, as a full disk does."""
+    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+
+
+@pytest.mark.parametrize("left", range(0, 60, 7))
+def test_a_column_that_came_on_a_full_disk_gets_its_name(path, left, caplog):
+    table = MetricsTable(path)
+    log(table, (0, {"a": 1.0}), (1, {"a": 2.0}))
+    before = path.read_text()
+    with largest_file(len(before) + left):
+        log(table, (2, {"a": 3.0, "first_validation": 0.25, "another_name": 0.5}))
+        log(table, (3, {"a": 4.0}), (4, {"b": 5.0}))
+        # A watcher reads whole rows under their names, or those from before.
+        assert read_history(path.parent)["a"][:2] == [(0, 1.0), (1, 2.0)]
+        assert len(caplog.messages) <= 1
+    log(table, (5, {"a": 6.0}))
+    assert read_history(path.parent) == {
+        "a": [(0, 1.0), (1, 2.0), (2, 3.0), (3, 4.0), (5, 6.0)],
+        "another_name": [(2, 0.5)],
+        "b": [(4, 5.0)],
+        "first_validation": [(2, 0.25)],
+    }
+    assert len(path.read_text().splitlines()) == 7
+    assert [file.name for file in path.parent.iterdir()] == ["metrics.csv"]
+
+
+@pytest.mark.parametrize("left", range(25))
+def test_a_row_that_did_not_fit_is_written_whole_later(path, left):
+    table = MetricsTable(path)
+    log(table, (0, {"a": 1.0, "b": 1.0}))
+    before = path.read_text()
+    with largest_file(len(before) + left):
+        log(table, (1, {"a": 0.123456, "b": 2.0}))
+    log(table, (2, {"a": 3.0, "b": 4.0}))
+    lines = ["step,epoch,a,b", "0,,1.0,1.0", "1,,0.123456,2.0", "2,,3.0,4.0"]
+    assert path.read_text().splitlines() == lines
+
+
+def test_a_table_of_an_earlier_version_that_lacks_a_name_is_read_and_continued(path):
+    path.parent.mkdir()
+    path.write_text("step,epoch,a\n0,0,1.0\n1,0,2.0,7.5\n,,9.0\n2,0,3.")
+    assert read_history(path.parent) == {"a": [(0, 1.0), (1, 2.0)]}
+    table = MetricsTable(path)
+    table.continue_from(2)
+    log(table, (2, {"a": 3.0, "b": 4.0}))
+    assert read_history(path.parent) == {"a": [(0, 1.0), (1, 2.0), (2, 3.0)], "b": [(2, 4.0)]}
 
 
 def test_no_table_is_an_empty_history(path):

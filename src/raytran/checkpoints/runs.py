@@ -16,7 +16,8 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from raytran.data.files import exclusive_lock, write_json
+from raytran.data.files import write_json
+from raytran.data.locks import exclusive_lock
 from raytran.errors import CheckpointError, ConfigError, RaytranError
 
 STAGE_NAMES = {"occupancy": "stage1", "joint": "stage2", "shape": "stage3", "view": "novel_view"}
@@ -60,8 +61,11 @@ def one_at_a_time(folder: Path) -> Iterator[int]:
     Raises:
         ConfigError: one does already.
     """
-    busy = ConfigError(f"another process trains in {folder}: wait for it to end, or stop it, and try again")
-    with exclusive_lock(folder / _LOCK, if_taken=busy) as descriptor:
+
+    def taken(who: str) -> ConfigError:
+        return ConfigError(f"another process trains in {folder} ({who}): wait for it to end, or stop it")
+
+    with exclusive_lock(folder / _LOCK, if_taken=taken) as descriptor:
         yield descriptor
 
 

@@ -28,7 +28,9 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from raytran.checkpoints.runs import STAGE_NAMES, first_ranks, run_folder
-from raytran.errors import ConfigError, RaytranError
+from raytran.data.files import disk_full
+from raytran.data.workers import ENDS_WITH, end_with_parent
+from raytran.errors import ConfigError, DataError, RaytranError
 from raytran.run.config_dir import config_dir
 from raytran.run.path_settings import check_run_folder, literal_paths, quoted
 from raytran.run.sweep.folder import register_sweep_resolver
@@ -76,6 +78,10 @@ _WITH_VALUE = {
 """Hydra's options that a word of their own may follow."""
 
 _WITH_OPTIONAL_VALUE = ("--info", "-i")
+_STARTER_ENDED = (
+    "the process that started this one has ended: it said why, or it was killed; give the same command "
+    "again, with resume=auto to go on with a run"
+)
 
 _TYPED_FULL_ERROR = os.environ.get(_FULL_ERROR)
 
@@ -114,6 +120,7 @@ def _compose_or_exit(name: str, command: Callable[[], Any], typed: str | None) -
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a file's name need not be text
+    _end_with_starter()
     _set_full_error("1")  # Hydra then raises instead of printing; the task restores what the user has set
     try:
         if name in _KEEP_A_LOG:
@@ -140,6 +147,15 @@ def _compose_or_exit(name: str, command: Callable[[], Any], typed: str | None) -
         _set_full_error(typed)
         # A resolver of ours that objects is wrapped by OmegaConf; its message is the clearer one.
         _exit_with(ConfigError(_first_line(error).split("resolving interpolation: ")[-1]))
+
+
+def _end_with_starter() -> None:
+    """End with the process that has started this command as a part of itself, if one has."""
+    starter = os.environ.pop(ENDS_WITH, None)
+    if starter is not None and starter.isdecimal():
+        end_with_parent(_STARTER_ENDED, parent=int(starter))
+    elif "TORCHELASTIC_RUN_ID" in os.environ:
+        end_with_parent(_STARTER_ENDED)
 
 
 def _options_first(words: Sequence[str]) -> list[str]:
@@ -257,6 +273,14 @@ def run_or_exit(function: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
         raise
     except OmegaConfBaseException as error:
         _exit_with(ConfigError(f"{str(error).splitlines()[0]} (see --cfg job for all settings)"))
+    except Exception as error:
+        full = disk_full(error)
+        if full is None:
+            raise
+        place = f"write {full.filename}" if full.filename else "go on writing"
+        _exit_with(
+            DataError(f"cannot {place} ({full.strerror}): make room there, then give the command again")
+        )
 
 
 def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:

@@ -27,6 +27,7 @@ WANDB_ID = "wandb-id.txt"
 _OFFLINE = ("offline", "dryrun")
 """Values of WANDB_MODE with which W&B keeps to this machine; the second is its former name."""
 
+_WITHOUT_COLUMN = ""
 _GROUP_RECORDS = ("sweep.json", "curriculum.json")
 """Files by which the folder of a sweep or of a curriculum is known."""
 
@@ -84,17 +85,13 @@ class MetricsTable(Logger):
         """Write the rows that wait; on a full disk they wait on."""
         if not self._waiting:
             return
-        known = set(self._columns)
-        new = sorted({name for row in self._waiting for name in row} - known)
+        is_known = {name for row in self._waiting for name in row} <= set(self._columns)
         try:
-            if new or not self.path.is_file():
-                rows = [*self._read(), *self._waiting]
-                self._columns += new
-                self._rewrite(rows)
+            # After a write that failed the file may end anywhere.
+            if is_known and not self._failed and self.path.is_file():
+                self._append(self._waiting)
             else:
-                with self.path.open("a", newline="", encoding="utf-8") as file:
-                    writer = csv.DictWriter(file, self._columns, lineterminator="\n")
-                    writer.writerows(self._waiting)
+                self._rewrite([*self._read(), *self._waiting])
         except OSError as error:
             if not self._failed:
                 reason = error.strerror
@@ -117,21 +114,49 @@ class MetricsTable(Logger):
         rows = [row for row in self._read() if int(row["step"]) < step]
         self._rewrite(rows)
 
+    def _append(self, rows: list[dict[str, Any]]) -> None:
+        text = io.StringIO()
+        csv.DictWriter(text, self._columns, lineterminator="\n").writerows(rows)
+        size = self.path.stat().st_size
+        try:
+            with self.path.open("a", newline="", encoding="utf-8") as file:
+                file.write(text.getvalue())
+        except OSError:
+            os.truncate(self.path, size)  # the disk was full in the middle of a row
+            raise
+
     def _read(self) -> list[dict[str, Any]]:
-        """Return the rows of the file, but for a last line that a kill cut short; take over its columns."""
-        if not self.path.is_file():
-            return []
-        lines = self.path.read_text(encoding="utf-8").splitlines(keepends=True)
-        rows = csv.DictReader(line for line in lines if line.endswith("\n"))
-        self._columns = list(rows.fieldnames or self._columns)
-        return list(rows)
+        """Return the rows of the file and take over its columns."""
+        columns, rows = _read_table(self.path)
+        self._columns = columns or self._columns
+        return rows
 
     def _rewrite(self, rows: list[dict[str, Any]]) -> None:
+        """Write the file anew; its columns count as known only once they are in it."""
+        new = {name for row in rows for name in row} - set(self._columns)
+        columns = [*self._columns, *sorted(new)]
         text = io.StringIO()
-        writer = csv.DictWriter(text, self._columns, lineterminator="\n")
+        writer = csv.DictWriter(text, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
         write_text(self.path, text.getvalue())
+        self._columns = columns
+
+
+def _read_table(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
+    """Return the columns and rows of a run's table, as far as they are whole; nothing if there is none.
+
+    Left out are a last line that a kill cut short, a row without a step, and values without a column, which
+    earlier versions wrote on a disk that had been full.
+    """
+    if not path.is_file():
+        return [], []
+    text = path.read_text(encoding="utf-8", errors="replace")
+    lines = [line for line in text.splitlines(keepends=True) if line.endswith("\n") and "\0" not in line]
+    table = csv.DictReader(lines, restkey=_WITHOUT_COLUMN)
+    columns = list(table.fieldnames or ())
+    rows = [{name: row[name] for name in columns} for row in table]
+    return columns, [row for row in rows if (row.get("step") or "").isdecimal()]
 
 
 def read_history(folder: Path) -> dict[str, list[tuple[int, float]]]:
@@ -140,15 +165,11 @@ def read_history(folder: Path) -> dict[str, list[tuple[int, float]]]:
     Args:
         folder: of the run.
     """
-    path = folder / METRICS
-    if not path.is_file():
-        return {}
     history: dict[str, dict[int, float]] = {}
-    with path.open(newline="", encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            for name, value in row.items():
-                if name not in ("step", "epoch") and value:
-                    history.setdefault(name, {})[int(row["step"])] = float(value)
+    for row in _read_table(folder / METRICS)[1]:
+        for name, value in row.items():
+            if name not in ("step", "epoch") and value:
+                history.setdefault(name, {})[int(row["step"])] = float(value)
     return {name: sorted(values.items()) for name, values in history.items()}
 
 

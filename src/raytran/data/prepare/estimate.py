@@ -14,7 +14,7 @@ from functools import partial
 from pathlib import Path
 from statistics import fmean, median
 
-from raytran.data.files import UNFINISHED, bytes_below
+from raytran.data.files import bytes_below, unfinished_name
 from raytran.data.prepare.annotation import used_models, without_models
 from raytran.data.prepare.report import gigabytes
 from raytran.data.prepare.scan import PrepareSettings, ScanJob, choose_frames, encoded_frame
@@ -76,7 +76,7 @@ def estimate(
     """
     counts = [_num_frames(jobs[i], settings) for i in choose_frames(len(jobs), _SCANS_COUNTED)]
     frames = round(fmean(counts) * len(jobs)) if counts else 0
-    with tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=output) as folder:
+    with tempfile.TemporaryDirectory(prefix=f"{unfinished_name()}-", dir=output) as folder:
         trial = Path(folder)
         model_cost = frame_cost = (0.0, 0.0)
         if shapenet is not None:

@@ -20,6 +20,7 @@ from raytran.checkpoints.file import shipped_weights
 from raytran.checkpoints.load import load_model, prediction_settings
 from raytran.checkpoints.network import own_packages
 from raytran.data.files import SettingsRecord, write_json
+from raytran.data.locks import exclusive_lock
 from raytran.errors import ConfigError
 from raytran.model import RayTran
 from raytran.run.demo.page import COLUMNS, ShownScene, headline, write_page
@@ -38,6 +39,7 @@ from raytran.training.datamodule import SceneDataModule
 _log = logging.getLogger(__name__)
 
 _RECORD = "demo.json"
+_LOCK = ".demo.lock"
 _RECORDED = ("preset", "seed", "model", "loss", "optimizer", "views", "rooms", "schedule")
 """Settings that a demo must share with the one it continues."""
 
@@ -93,6 +95,16 @@ def demo(cfg: DictConfig) -> DemoResult:
         ConfigError: the folder holds a demo with other settings.
     """
     output = Path(cfg.output).resolve()
+
+    def taken(who: str) -> ConfigError:
+        return ConfigError(f"another process makes the demo in {output} ({who}): wait, or give output=")
+
+    with exclusive_lock(output / _LOCK, if_taken=taken):
+        return _demo(cfg, output)
+
+
+def _demo(cfg: DictConfig, output: Path) -> DemoResult:
+    """Make the demo in a folder that nobody else writes."""
     overrides = [f"preset={cfg.preset}", f"data.root={quoted(output / 'rooms')}", *plain(cfg.overrides)]
     data = _data(overrides, output)
     times = StepTimes(output / "times.json")

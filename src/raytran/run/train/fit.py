@@ -28,6 +28,7 @@ from raytran.run.device import cudnn_warning, set_matmul_precision
 from raytran.run.train.build import build_data, build_model, build_module, build_trainer, plain
 from raytran.run.train.memory import explained_out_of_memory
 from raytran.run.train.parent import find_parent, stages_after
+from raytran.run.train.rank_processes import rank_processes
 from raytran.run.train.settings import RunConfig
 from raytran.run.train.start_report import changed_settings, start_report
 from raytran.training.callbacks.stage import StageCallback
@@ -113,7 +114,7 @@ def _train(cfg: DictConfig, run: RunConfig, folder: Path) -> FitResult:
         _log.warning("%s", warning)
     began = time.monotonic()
     try:
-        with explained_out_of_memory(cfg):
+        with explained_out_of_memory(cfg), rank_processes(trainer):
             trainer.fit(module, data, ckpt_path=start.resume_from)
     except StopRequestedError as stop:
         # One rank tells the shell; Lightning and torchrun would take codes of the others for a crash.
