@@ -18,6 +18,9 @@ from raytran.errors import DataError
 MAX_SIDE = 8192
 """Most pixels along a side of an image that is decoded: a few bytes can claim any number."""
 
+MAX_STEPS = 10**9
+"""Most steps of a training."""
+
 _SHOWN = 40
 """Characters of a wrong value that a message shows."""
 
@@ -40,6 +43,20 @@ POSITION = Quantity("a position", -1e6, 1e6)
 """Coordinate in a world, in its unit. In millimetres that is a kilometre; positions on the globe, of millions
 of metres, would lose their centimetres in float32."""
 
+COORDINATE = Quantity("a coordinate of a mesh", -1e9, 1e9)
+"""In the unit of its file, which may be a micrometre."""
+
+VOXEL_CUBE = Quantity("a side of a cube of voxels", 1e-12, 1e9)
+
+HALF_EXTENT = Quantity("half a length of a box", 0, 1e4)
+"""Of a CAD model's box, in its unit; a flat sheet has none along one axis."""
+
+QUATERNION = Quantity("a part of a quaternion", -1e6, 1e6)
+"""Of any length: the evaluation scripts take them as they are."""
+
+CAD_SCALE = Quantity("a scale of a CAD model", -1e4, 1e4)
+"""As annotated: negative for a mirrored model, almost 0 for one that is left out."""
+
 BOX_SIDE = Quantity("a length in metres", 1e-6, 1e4)
 """Side of an object's box."""
 
@@ -47,11 +64,12 @@ MATRIX_ENTRY = Quantity("an entry of a transformation", -1e6, 1e6)
 """Entry of a matrix that rotates, scales and shifts."""
 
 SCALE = Quantity("a positive scale", 1e-6, 1e6)
-"""Factor between two units or of a CAD model."""
+"""Factor between two units, or of a predicted CAD model."""
 
 SCORE = Quantity("a score", -1e6, 1e6)
 """Confidence; only its order counts, and programs write logits too."""
 
+SHARE = Quantity("a share", 0, 1)
 FOCAL_LENGTH = Quantity("a focal length in pixels", 1e-2, 1e7)
 PIXEL = Quantity("a pixel coordinate", -1e6, 1e6)
 SIDE = Quantity("a number of pixels", 1, MAX_SIDE)

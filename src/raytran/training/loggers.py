@@ -8,6 +8,7 @@ import io
 import logging
 import os
 import secrets
+from collections.abc import Iterator, Mapping
 from netrc import NetrcParseError, netrc
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from raytran.data.files import write_text
 from raytran.errors import ConfigError
+from raytran.limits import MAX_STEPS
 
 _log = logging.getLogger(__name__)
 
@@ -111,17 +113,18 @@ class MetricsTable(Logger):
         """Forget what was logged at ``step`` and later: the run does these steps again."""
         if not self.path.is_file():
             return
-        rows = [row for row in self._read() if int(row["step"]) < step]
+        rows = [row for row in self._read() if (_step_of(row) or 0) < step]
         self._rewrite(rows)
 
     def _read(self) -> list[dict[str, Any]]:
         """Return the rows of the file, but for a last line that a kill cut short; take over its columns."""
         if not self.path.is_file():
             return []
-        lines = self.path.read_text(encoding="utf-8").splitlines(keepends=True)
-        rows = csv.DictReader(line for line in lines if line.endswith("\n"))
-        self._columns = list(rows.fieldnames or self._columns)
-        return list(rows)
+        lines = self.path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
+        table = csv.DictReader(line for line in lines if line.endswith("\n"))
+        rows = list(_rows(table))
+        self._columns = list(table.fieldnames or self._columns)
+        return [row for row in rows if None not in row and _step_of(row) is not None]
 
     def _rewrite(self, rows: list[dict[str, Any]]) -> None:
         text = io.StringIO()
@@ -129,6 +132,28 @@ class MetricsTable(Logger):
         writer.writeheader()
         writer.writerows(rows)
         write_text(self.path, text.getvalue())
+
+
+def _rows(table: csv.DictReader[str]) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a table up to a damage: they are for pictures, and no run should end for one."""
+    try:
+        yield from table
+    except csv.Error as error:
+        _log.warning("the rest of the logged values is not read: %s", error)
+
+
+def _step_of(row: Mapping[str, Any]) -> int | None:
+    """Return the step of a row, None if it is damaged."""
+    step = _number(row.get("step"))
+    return int(step) if step is not None and 0 <= step <= MAX_STEPS else None
+
+
+def _number(cell: Any) -> float | None:
+    """Return the number in a cell, None if there is none; a loss may be infinite."""
+    try:
+        return float(cell)
+    except (TypeError, ValueError):
+        return None
 
 
 def read_history(folder: Path) -> dict[str, list[tuple[int, float]]]:
@@ -141,11 +166,13 @@ def read_history(folder: Path) -> dict[str, list[tuple[int, float]]]:
     if not path.is_file():
         return {}
     history: dict[str, dict[int, float]] = {}
-    with path.open(newline="", encoding="utf-8") as file:
-        for row in csv.DictReader(file):
+    with path.open(newline="", encoding="utf-8", errors="replace") as file:
+        for row in _rows(csv.DictReader(file)):
+            step = _step_of(row)
             for name, value in row.items():
-                if name not in ("step", "epoch") and value:
-                    history.setdefault(name, {})[int(row["step"])] = float(value)
+                number = _number(value)
+                if name not in (None, "step", "epoch") and number is not None and step is not None:
+                    history.setdefault(name, {})[step] = number
     return {name: sorted(values.items()) for name, values in history.items()}
 
 

@@ -351,8 +351,8 @@ def test_header_row_and_empty_line(files):
         ("csv/c.json", scene_json("c", box("chair", [0, 0, math.nan], [1, 1, 1])), "line 8: a number is not"),
         ("csv/c.json", scene_json("a"), r"c\.json says that it is scene 'a'"),
         ("csv/c.json", scene_json("c")[:50], r"c\.json as JSON .*line \d"),
-        ("annotations.json", json.dumps(SCENES)[:700], r"annotations\.json is not valid JSON .*line 1"),
-        ("annotations.json", json.dumps([*SCENES, SCENES[0]]), r"entry 3 of .*scene a occurs twice"),
+        ("annotations.json", json.dumps(SCENES)[:700], r"annotations\.json is no valid JSON .*line 1"),
+        ("annotations.json", json.dumps([*SCENES, SCENES[0]]), r"entry 3 of .*scene 'a' occurs twice"),
     ],
 )
 def test_bad_files(files, name, content, message):
