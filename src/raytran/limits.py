@@ -13,10 +13,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from raytran.errors import DataError
+from raytran.errors import DataError, RaytranError
 
 MAX_SIDE = 8192
 """Most pixels along a side of an image that is decoded: a few bytes can claim any number."""
+
+MAX_VIEWS = 100_000
+"""Most frames of a scan, or views that a network is given."""
 
 MAX_STEPS = 10**9
 """Most steps of a training."""
@@ -80,26 +83,29 @@ TIMESTAMP = Quantity("a time stamp", -1e20, 1e20)
 """Time since any moment in seconds, or in milli-, micro- or nanoseconds since 1970."""
 
 
-def as_number(value: object, quantity: Quantity, what: str) -> float:
+def as_number(
+    value: object, quantity: Quantity, what: str, *, error: type[RaytranError] = DataError
+) -> float:
     """Return a value that is a number within the bounds of what it measures.
 
     Args:
         value: what a file or setting holds, of any type.
         quantity: what it measures.
         what: name of the value and its place, e.g. ``fx in cameras.json``.
+        error: what to raise.
 
     Raises:
         DataError: it is no number, not finite, or out of bounds.
     """
     number = _as_float(value)
     if not quantity.low <= number <= quantity.high:  # also if it is not a number
-        raise DataError(
+        raise error(
             f"{what} is {shown(value)}, not {quantity.name} of {quantity.low:g} to {quantity.high:g}: mend it"
         )
     return number
 
 
-def as_count(value: object, low: int, high: int, what: str) -> int:
+def as_count(value: object, low: int, high: int, what: str, *, error: type[RaytranError] = DataError) -> int:
     """Return a value that is a whole number from ``low`` to ``high``; 4.0 is one, 4.5, "4" and True are none.
 
     Raises:
@@ -107,7 +113,7 @@ def as_count(value: object, low: int, high: int, what: str) -> int:
     """
     number = _as_float(value)
     if not (low <= number <= high and number == int(number)):
-        raise DataError(f"{what} is {shown(value)}, not a whole number from {low} to {high}: mend it")
+        raise error(f"{what} is {shown(value)}, not a whole number from {low} to {high}: mend it")
     return int(number)
 
 
