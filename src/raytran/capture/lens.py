@@ -23,7 +23,7 @@ from torch import Tensor
 from torch.nn.functional import grid_sample
 
 from raytran.errors import ConfigError, DataError
-from raytran.limits import MAX_SIDE
+from raytran.limits import FOCAL_LENGTH, MAX_SIDE
 
 _SAME_PX = 0.25
 """Largest shift of a pixel for which an image is used without resampling, pixels."""
@@ -215,7 +215,7 @@ def check_lens(lens: Lens, where: str) -> Lens:
             ``MAX_SIDE``, the principal point is far off the centre, or the distortion folds the image.
     """
     numbers = (*lens.focal, *lens.center, *lens.distortion, lens.radial_8)
-    if not np.isfinite(numbers).all() or min(lens.focal) <= 0:
+    if not (np.abs(numbers) <= FOCAL_LENGTH.high).all() or min(lens.focal) < FOCAL_LENGTH.low:
         raise DataError(f"{where} has no positive, finite focal lengths and centre: calibrate it again")
     height, width = lens.size
     if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE):

@@ -251,7 +251,7 @@ def check_content(content: Any, path: Path) -> None:
         if content.get(name) is not None and not is_proper(content[name]):
             raise CheckpointError(f"{path} is no checkpoint of raytran: its '{name}' is damaged")
     if not all(
-        isinstance(name, str) and isinstance(value, Tensor) and value.layout is torch.strided
+        isinstance(value, Tensor) and value.layout is torch.strided and not value.is_complex()
         for name, value in content["state_dict"].items()
     ):
         raise CheckpointError(f"{path} is no checkpoint of raytran: some of its weights are no tensors")

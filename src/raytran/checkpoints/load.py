@@ -133,7 +133,7 @@ def load_weights(
     kept = tuple(f"{part}." for part in fresh)
     state = {name: value for name, value in _state(checkpoint).items() if not name.startswith(kept)}
     for name, value in state.items():
-        if value.is_floating_point() and not _widened(value).isfinite().all():
+        if value.is_floating_point() and not _in_float32(value).isfinite().all():
             raise CheckpointError(
                 f"{shown(name)} in {path} is not finite: take a checkpoint from before the training diverged"
             )
@@ -148,9 +148,9 @@ def load_weights(
         ) from error
 
 
-def _widened(value: torch.Tensor) -> torch.Tensor:
-    """Return numbers of eight bits as those of 32: PyTorch cannot say of them whether they are finite."""
-    return value.float() if value.element_size() == 1 else value
+def _in_float32(value: torch.Tensor) -> torch.Tensor:
+    """Return numbers as those of 32 bits, as they are computed with: of 64, some become infinite by it."""
+    return value if value.dtype in (torch.float32, torch.float16, torch.bfloat16) else value.float()
 
 
 def fresh_parts(model: RayTran, checkpoint: Mapping[str, Any], may_be_missing: Sequence[str]) -> list[str]:

@@ -389,6 +389,7 @@ def read_roca_csv(path: Path) -> dict[str, CadAlignments]:
 def _read_rows(path: Path, columns: tuple[str, ...], n_names: int) -> list[_Row]:
     rows: list[_Row] = []
     not_unit: list[int] = []
+    is_first = True
     try:
         table = list(csv.reader(read_text(path, max_bytes=_MAX_CSV).splitlines()))
     except csv.Error as error:
@@ -402,7 +403,8 @@ def _read_rows(path: Path, columns: tuple[str, ...], n_names: int) -> list[_Row]
                 f"{path}, line {line} has {len(cells)} columns: write the {len(columns)} columns "
                 f"{','.join(columns)}"
             )
-        if not rows and _is_header(cells[n_names:]):
+        is_first, may_be_header = False, is_first
+        if may_be_header and _is_header(cells[n_names:]):
             _log.warning("%s, line %d: skipped a header row", path, line)
             continue
         row = _Row(line, cells[:n_names], _numbers(cells[n_names:], columns[n_names:], path, line))
