@@ -232,6 +232,8 @@ def test_lenses_of_two_cameras_are_refused():
     [
         (replace(PLAIN, focal=(0.0, 1.0)), "no positive, finite focal lengths"),
         (replace(PLAIN, center=(float("nan"), 1.0)), "no positive, finite"),
+        (replace(PLAIN, center=(1e300, 1.0)), "no positive, finite"),
+        (replace(PLAIN, focal=(1e-300, 1.0)), "no positive, finite"),
         (replace(FISHEYE, distortion=(float("inf"), 0.0, 0.0, 0.0)), "no positive, finite"),
         (replace(FISHEYE, distortion=(-3.0, 0.0, 0.0, 0.0)), "folds the image onto itself"),
         (replace(PLAIN, size=(100_000, 100_000)), "for images of 100000x100000.*shrink"),

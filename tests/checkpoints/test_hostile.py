@@ -139,6 +139,17 @@ def test_weights_that_are_not_finite_are_named(write, whole, value):
     assert "is not finite" in said
 
 
+def test_weights_that_become_infinite_in_float32_are_named(write, whole):
+    name = next(iter(whole["state_dict"]))
+    weight = whole["state_dict"][name].double() * 1e300 + 1e300
+    assert "is not finite" in refusal(write(f"state_dict/{name}", weight))
+
+
+def test_complex_weights_are_none(write, whole):
+    name = next(iter(whole["state_dict"]))
+    assert "no tensors" in refusal(write(f"state_dict/{name}", whole["state_dict"][name].to(torch.complex64)))
+
+
 def test_references_that_multiply_are_refused(tmp_path, whole):
     """A pickle names one list many times: two hundred bytes for ten to the twentieth values."""
     for place in ("model", "config", "scores"):

@@ -106,3 +106,9 @@ def test_rocas_file_holds_many_scenes(tmp_path):
     assert scenes["a"].model_id == ("03001627/abc",)
     with pytest.raises(DataError, match="line 1 has 12 columns"):
         read_roca_csv(write(tmp_path, ROW))
+
+
+def test_only_the_first_row_may_be_a_header(tmp_path):
+    header = "catid_cad,id_cad,tx,ty,tz,qw,qx,qy,qz,sx,sy,sz"
+    with pytest.raises(DataError, match="line 2: tx is 'tx'"):
+        read_alignments_csv(write(tmp_path, *[header] * 100))

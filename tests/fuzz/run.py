@@ -92,7 +92,7 @@ class _Worker:
             pass
         took = time.monotonic() - self.began
         alive = self._process.is_alive()
-        if alive and took < 3 * SECONDS:
+        if alive and took < 6 * SECONDS:
             return None
         finding = (
             f"no answer after {took:.0f} s" if alive else f"the interpreter died ({self._process.exitcode})"
