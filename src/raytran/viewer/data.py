@@ -338,7 +338,8 @@ def _read_mesh(path: Path) -> trimesh.Trimesh | None:
     if not path.is_file():
         return None
     try:
-        mesh = trimesh.load_mesh(path, process=False)
+        with np.errstate(all="ignore"):  # what numbers there are is looked at below
+            mesh = trimesh.load_mesh(path, process=False)
     except Exception as error:  # trimesh raises whatever its parser stumbles over
         raise DataError(f"cannot read the mesh {path} ({str(error)[:80]!r}): predict again") from error
     if not isinstance(mesh, trimesh.Trimesh) or not (np.abs(mesh.vertices) <= POSITION.high).all():

@@ -66,7 +66,8 @@ def read_piece(library: FurnitureLibrary, piece: Piece, turn_deg: float = 0.0) -
         )
     try:
         resolver = library.files_beside(piece.model)
-        scene = trimesh.load_scene(io.BytesIO(data), file_type="obj", resolver=resolver)
+        with np.errstate(all="ignore"):  # what numbers there are is looked at below
+            scene = trimesh.load_scene(io.BytesIO(data), file_type="obj", resolver=resolver)
     except (ValueError, IndexError, KeyError, TypeError, OSError, Image.DecompressionBombError) as error:
         raise DataError(
             f"{piece.model} in {library.path} is damaged ({str(error)[:80]!r}); copy it again"
