@@ -42,6 +42,9 @@ from raytran.setting_limits import check_settings
         ("batch_size", 10**12),
         ("num_workers", 10**6),
         ("processes", -1),
+        ("scale", 1e300),
+        ("ceilings", [0, math.nan]),
+        ("num_resamples", 10**9),
     ],
 )
 def test_a_number_beyond_its_meaning_is_named(name, value):

@@ -16,6 +16,7 @@ from raytran.limits import (
     MAX_SIDE,
     MAX_STEPS,
     MAX_VIEWS,
+    SCALE,
     SHARE,
     Quantity,
     as_count,
@@ -56,11 +57,12 @@ _COUNTS: dict[str, tuple[int, int]] = {
     **dict.fromkeys(("batch", "batch_size", "accumulate_grad_batches"), (1, 1_000_000)),
     **dict.fromkeys(("num_workers", "processes"), (0, _PROCESSES)),
     "seed": (0, 2**32 - 1),
+    "num_nodes": (1, 100_000),
     # data and scores
     **dict.fromkeys(("num_train", "num_val", "num_test"), (0, _ROOMS)),
     **dict.fromkeys(("min_objects", "max_objects"), (0, 1000)),
     "checks": (1, _ROOMS),
-    "num_resamples": (1, _ROOMS),
+    "num_resamples": (1, 100_000),
 }
 """Least and largest value of each whole number."""
 
@@ -72,6 +74,8 @@ _NUMBERS: dict[str, Quantity] = {
     **dict.fromkeys(("grid_extent", "extent", "volume_extent"), BOX_SIDE),
     "room_size": Quantity("a length in metres", 1, 1000),
     "norm_momentum": SHARE,
+    "scale": SCALE,
+    "ceilings": _POSITIVE,
     **dict.fromkeys(("learning_rate", "weight_decay", "gradient_clip", "gradient_clip_val"), _FACTOR),
     **dict.fromkeys(("score_threshold", "duplicate_iou", "mirror", "frame_dropout"), SHARE),
     **dict.fromkeys(("brightness", "contrast", "saturation"), SHARE),

@@ -448,7 +448,7 @@ def _checked_length(row: _Row, path: Path) -> float:
     length = math.hypot(*row.values[3:7])
     if length < _LEAST_LENGTH:
         raise DataError(f"{path}, line {row.line}: the quaternion has length zero, write a rotation")
-    if min(row.values[7:10]) <= 0:
+    if min(row.values[7:10]) < SCALE.low:
         raise DataError(f"{path}, line {row.line}: a scale is not positive, write sizes in metres a CAD unit")
     return length
 

@@ -356,6 +356,7 @@ def test_header_row_and_empty_line(files):
         ("csv/c.json", scene_json("c", box(["chair"], [0, 0, 0], [1, 1, 1])), "category \\['chair'\\]"),
         ("csv/a.csv", row(CHAIR, "c1", (1e300, 0, 0)), r"tx in line 1 of .*a\.csv is 1e\+300"),
         ("csv/a.csv", row(CHAIR, "c1", (0, 0, 0), scale=(1e300, 1, 1)), "sx in line 1"),
+        ("csv/a.csv", row(CHAIR, "c1", (0, 0, 0), scale=(1e-300, 1, 1)), r"a\.csv, line 1: a scale"),
         ("csv/a.csv", row(CHAIR, "c1", (0, 0, 0), scale=(1e6, 1, 1)), "a box of .* m: write sizes"),
         ("csv/c.json", scene_json("a"), r"c\.json says that it is scene 'a'"),
         ("csv/c.json", scene_json("c")[:50], r"c\.json is no valid JSON .*line \d"),
