@@ -27,7 +27,7 @@ def main() -> int:
         "--keep", type=Path, default=Path("fuzz-findings"), help="where inputs of findings go"
     )
     parser.add_argument("--only", type=int, help="number of one input to run again")
-    parser.add_argument("--kinds", default="", help="only inputs whose name contains this")
+    parser.add_argument("--kinds", default="", help="only kinds with one of these in their name: csv,ckpt")
     parser.add_argument("--processes", type=int, default=1)
     arguments = parser.parse_args()
     if arguments.only is not None:

@@ -127,7 +127,7 @@ def fuzz(
         count: how many; every kind comes in turn.
         seed: another one makes other inputs.
         keep: folder for the inputs of findings, each with what was said; None: they are not kept.
-        names: only kinds whose name contains this.
+        names: only kinds whose name contains one of these words, parted by commas.
         processes: readers at work at a time.
         first: number of the first input.
         seconds: begin no input after so long.
@@ -173,7 +173,8 @@ def one(number: int, *, seed: int = 0, keep: Path, names: str = "") -> Verdict:
 
 
 def _chosen(root: Path, names: str) -> list[Input]:
-    kinds = [kind for kind in all_inputs(root / "plain") if names in kind.name]
+    parts = names.split(",")
+    kinds = [kind for kind in all_inputs(root / "plain") if any(part in kind.name for part in parts)]
     if not kinds:
         raise SystemExit(f"no kind of input is called {names}")
     return kinds
