@@ -19,10 +19,11 @@ from raytran.backbone.backbone import VoxelBackbone
 from raytran.errors import ConfigError, DataError, ShapeError, check_shape
 from raytran.geometry.camera import Cameras
 from raytran.geometry.checks import check_views
-from raytran.geometry.grid import VoxelGrid
+from raytran.geometry.grid import VoxelGrid, checked_grid
 from raytran.heads.objects import ObjectOutputs, objects_of_queries
 from raytran.ops.pairs import Pairs
 from raytran.ops.traverse import Attention, RayTracer, count_views
+from raytran.setting_limits import check_settings
 from raytran.structs import ObjectSet, RawScene, SceneBatch, ScenePrediction, Views
 
 TASKS = ("occupancy", "foreground", "objects")
@@ -54,8 +55,8 @@ class RayTran(nn.Module):
             (``sparse``), or the former where they run and the latter elsewhere (``auto``).
 
     Raises:
-        ConfigError: the foreground or view head does not grow the features back to image size, or there is no
-            such attention.
+        ConfigError: the foreground or view head does not grow the features back to image size, there is no
+            such attention, or no such voxel grid.
     """
 
     def __init__(
@@ -77,8 +78,8 @@ class RayTran(nn.Module):
                 )
         self.backbone = backbone
         self.heads = nn.ModuleDict(heads)
-        self.grid_resolution = (int(grid_resolution[0]), int(grid_resolution[1]), int(grid_resolution[2]))
-        self.grid_extent = (float(grid_extent[0]), float(grid_extent[1]), float(grid_extent[2]))
+        self.grid_resolution, self.grid_extent = checked_grid(grid_resolution, grid_extent)
+        check_settings({"rays_per_cell": rays_per_cell})
         self.rays_per_cell = rays_per_cell
         self.ray_tracer = RayTracer(attention)
 

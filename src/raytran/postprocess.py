@@ -17,6 +17,7 @@ from torch import Tensor
 from raytran.geometry.boxes import OrientedBoxes, box_iou
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.room_tiles import Volumes
+from raytran.setting_limits import check_settings
 from raytran.structs import ObjectSet, ScenePrediction
 
 SCORE_THRESHOLD = 0.5
@@ -53,7 +54,11 @@ def select_objects(
         duplicate_iou: leave out an object whose box overlaps one of the same class and of higher score by
             more than this IoU. None: leave out none, since the network is trained to predict each object
             once (RayTran §3.2).
+
+    Raises:
+        ConfigError: one of these is no share.
     """
+    check_settings({"score_threshold": score_threshold, "duplicate_iou": duplicate_iou})
     objects = prediction.objects
     kept = (objects.score >= score_threshold).nonzero().squeeze(1)
     objects = objects.select(kept[objects.score[kept].argsort(descending=True, stable=True)])

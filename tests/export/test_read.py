@@ -156,3 +156,9 @@ def test_rows_of_no_form(tmp_path, rows, said):
     with pytest.raises(DataError, match=said) as caught:
         read_roca_csv(write(tmp_path, *rows))
     assert len(str(caught.value)) - len(str(tmp_path)) < 260
+
+
+def test_only_the_first_row_may_be_a_header(tmp_path):
+    header = "catid_cad,id_cad,tx,ty,tz,qw,qx,qy,qz,sx,sy,sz"
+    with pytest.raises(DataError, match="line 2: tx is 'tx'"):
+        read_alignments_csv(write(tmp_path, *[header] * 100))

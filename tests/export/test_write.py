@@ -95,17 +95,20 @@ def test_a_mesh_or_a_name_is_missing(tmp_path, prediction, cameras):
     ("content", "message"),
     [
         (None, "no scene file at"),
-        ("{", "cannot read"),
-        ("[" * 100_000, "cannot read"),
-        ("9" * 5000, "cannot read"),
-        ('{"format": "raytran.scene/1", "scene_id": "a", "objects": ["x"]}', "malformed"),
+        ("{", "no valid JSON"),
+        ("[" * 100_000, "no valid JSON"),
+        ("9" * 5000, "not a JSON object"),
+        ('{"format": "raytran.scene/1", "scene_id": "a", "objects": ["x"]}', "no list of objects"),
         (
             '{"format": "raytran.scene/1", "scene_id": "a", "objects": [{"category": "chair", "center": '
             f"[1{'0' * 400}, 0, 0]" + "}]}",
-            "malformed",
+            "size of the objects in",
         ),
         ('{"format": "other"}', "has format 'other'"),
-        ('{"format": "raytran.scene/1", "scene_id": "a", "objects": [{"category": "ship"}]}', "malformed"),
+        (
+            '{"format": "raytran.scene/1", "scene_id": "a", "objects": [{"category": "ship"}]}',
+            "category 'ship'",
+        ),
     ],
 )
 def test_damaged_files_are_named(tmp_path, content, message):

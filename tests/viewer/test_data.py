@@ -2,7 +2,11 @@
 from __future__ import annotations
 
 import json
+import pickle
+import tracemalloc
+import zipfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -224,3 +228,72 @@ def test_nothing_to_show(tmp_path):
         find_scenes(tmp_path / "nowhere")
     with pytest.raises(DataError, match=r"holds no scene\.json"):
         find_scenes(tmp_path)
+
+
+def replaced(path: Path, name: str, values: object) -> None:
+    """Write a viewer file again with another array, or with bytes in place of one."""
+    with np.load(path) as file:
+        arrays = dict(file)
+    if isinstance(values, dict):
+        about = json.loads(arrays["about"].tobytes()) | values
+        arrays["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
+    elif not isinstance(values, bytes):
+        arrays[name] = np.asarray(values)
+    np.savez_compressed(path, **arrays)
+    if isinstance(values, bytes):
+        with zipfile.ZipFile(path) as archive:
+            parts = {part: archive.read(part) for part in archive.namelist()}
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            for part, content in (parts | {f"{name}.npy": values}).items():
+                archive.writestr(part, content)
+
+
+HUGE = (
+    b"\x93NUMPY\x01\x00\x76\x00"
+    + b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(118)
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("world_from_camera", HUGE),
+        ("frame0", bytes(200_000_000)),
+        ("frame0", pickle.dumps({})),
+        ("frame0", np.frombuffer(b"GIF89a" + bytes(100), np.uint8)),
+        ("intrinsics", np.full((5, 3, 3), np.nan)),
+        ("intrinsics", np.zeros((5, 3, 3))),
+        ("intrinsics", np.full((5, 3, 3), 1e300)),
+        ("world_from_camera", np.zeros((5, 4, 4))),
+        ("world_from_camera", np.eye(4)),
+        ("world_from_camera", np.array([None])),
+        ("volume0_occupancy", np.zeros(7, np.uint8)),
+        ("volume0_offsets", np.array([0, 5], np.int32)),
+        ("volume0_steps", np.array([-1], np.int32)),
+        ("volume0_weights", np.array([1.5])),
+        ("about", {"image_size": [0, 10]}),
+        ("about", {"image_size": [10**9, 10]}),
+        ("about", {"frame_ids": ["a"] * 10}),
+        ("about", {"frame_ids": [5] * 5}),
+        ("about", {"frame_ids": {"a": 1}}),
+        ("about", {"format": "x" * 10**6}),
+        ("truth_size", np.full((6, 3), np.nan)),
+        ("truth_label", np.full(6, 99)),
+        ("truth_score", np.zeros((6, 6))),
+        ("about", {"volumes": [{"resolution": [-1, 0, 3], "extent": [1, 1, 1], "center": [0, 0, 0]}]}),
+        ("about", {"volumes": [5]}),
+        ("about", {"volumes": [{"resolution": [2, 2, 2], "extent": [1, 1, 1], "center": [0, 0, 1e300]}]}),
+    ],
+)
+def test_nonsense_in_the_viewers_file_is_one_short_sentence(tmp_path, name, values):
+    result = write_result(tmp_path / "room")
+    path = result / "viewer.npz"
+    replaced(path, name, values)
+    tracemalloc.start()
+    try:
+        with pytest.raises(DataError, match=r"cannot read .*viewer\.npz \(.*\): predict again") as error:
+            read_viewer_scene(result)
+        assert tracemalloc.get_traced_memory()[1] < 3e8
+    finally:
+        tracemalloc.stop()
+    assert len(str(error.value).replace(str(path), "PATH")) < 300

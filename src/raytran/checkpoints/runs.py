@@ -7,7 +7,6 @@ before it while it goes on and, once its last step is done, ``finished.json``.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,7 +17,9 @@ from typing import Any
 
 from raytran.data.files import write_json
 from raytran.data.locks import exclusive_lock
-from raytran.errors import CheckpointError, ConfigError, RaytranError
+from raytran.data.text import as_name, read_json_object
+from raytran.errors import CheckpointError, ConfigError, DataError, RaytranError
+from raytran.limits import MAX_STEPS, as_count
 
 STAGE_NAMES = {"occupancy": "stage1", "joint": "stage2", "shape": "stage3", "view": "novel_view"}
 """Former name of a stage → its name."""
@@ -95,12 +96,23 @@ def read_finished(folder: Path) -> Finished | None:
     if not path.is_file():
         return None
     try:
-        mark = Finished(**json.loads(path.read_text()))
-        return replace(mark, stage=STAGE_NAMES.get(mark.stage, mark.stage))
-    except (ValueError, TypeError) as error:
+        mark = Finished(**read_json_object(path))
+        _check_mark(mark)
+    except (DataError, TypeError) as error:
         raise CheckpointError(
             f"{path} is damaged: delete it and run that stage again with resume=auto"
         ) from error
+    return replace(mark, stage=STAGE_NAMES.get(mark.stage, mark.stage))
+
+
+def _check_mark(mark: Finished) -> None:
+    """Raise DataError unless every part of a mark is what it should be."""
+    for name in ("stage", "preset", "experiment", "time"):
+        as_name(getattr(mark, name), name)
+    as_count(mark.steps, 0, MAX_STEPS, "steps")
+    checkpoint = Path(as_name(mark.checkpoint, "checkpoint"))
+    if checkpoint.is_absolute() or ".." in checkpoint.parts or not isinstance(mark.data, dict | None):
+        raise DataError("checkpoint leads out of the run's folder, or data is no object")
 
 
 def finished_runs(

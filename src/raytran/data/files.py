@@ -22,6 +22,7 @@ from typing import Any
 from uuid import uuid4
 
 from raytran.data.locks import Process
+from raytran.data.text import read_json_object
 from raytran.errors import DataError
 
 UNFINISHED = ".unfinished-"
@@ -224,10 +225,9 @@ class SettingsRecord:
     def read(self) -> dict[str, Any]:
         """Return the recorded settings; empty if there is no record or it is damaged."""
         try:
-            settings = json.loads(self.path.read_text(encoding="utf-8"))
-        except (FileNotFoundError, ValueError):
+            return read_json_object(self.path)
+        except DataError:
             return {}
-        return settings if isinstance(settings, dict) else {}
 
     def begin(self, settings: Mapping[str, Any]) -> list[str]:
         """Write the settings if there is no record yet; return the names of those that differ from it.

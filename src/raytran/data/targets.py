@@ -20,6 +20,7 @@ from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.rasterize import rasterize_ids, rasterize_mask, rasterize_visible
+from raytran.limits import POSITION
 from raytran.structs import SHAPE_SIZE, ObjectSet
 
 _MAX_POINTS = 1 << 25
@@ -224,12 +225,16 @@ def _scan_surface(path: Path, _content: str) -> tuple[NDArray, NDArray]:
         DataError: it cannot be read.
     """
     try:
-        mesh = trimesh.load(path, process=False)
+        with np.errstate(all="ignore"):  # what numbers there are is looked at below
+            mesh = trimesh.load(path, process=False)
     except Exception as error:  # a damaged file can fail anywhere in trimesh
-        raise DataError(f"cannot read the mesh {path} ({error}): copy it again") from error
+        raise DataError(f"cannot read the mesh {path} ({str(error)[:80]!r}): copy it again") from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise DataError(f"{path} holds no triangles: copy the scan's mesh again")
-    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    if not (np.abs(vertices) <= POSITION.high).all() or faces.min() < 0 or faces.max() >= len(vertices):
+        raise DataError(f"{path} has triangles of points that are nowhere: copy the scan's mesh again")
+    return vertices, faces
 
 
 def cad_meshes(objects: ObjectSet, *, shapenet_root: Path) -> list[tuple[NDArray, NDArray]]:

@@ -17,6 +17,7 @@ import numpy as np
 
 from raytran.data.files import UNFINISHED, SettingsRecord, sweep, write_text
 from raytran.data.locks import lock_when_free
+from raytran.data.text import read_json_object
 from raytran.data.workers import work_on
 from raytran.errors import ConfigError, DataError
 from raytran.rooms.library import (
@@ -271,9 +272,7 @@ def _record(output: Path) -> SettingsRecord:
 def _write_lists(output: Path, splits: Sequence[RoomSplit]) -> int:
     """Write the split files and the annotations of all scans; return the number of objects."""
     entries = [
-        json.loads(annotation_path(output, scan_id).read_text(encoding="utf-8"))
-        for split in splits
-        for scan_id in split.scan_ids
+        read_json_object(annotation_path(output, scan_id)) for split in splits for scan_id in split.scan_ids
     ]
     write_text(output / "scan2cad" / "full_annotations.json", json.dumps(entries))
     counts = {

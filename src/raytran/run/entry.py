@@ -34,6 +34,7 @@ from raytran.errors import ConfigError, DataError, RaytranError
 from raytran.run.config_dir import config_dir
 from raytran.run.path_settings import check_run_folder, literal_paths, quoted
 from raytran.run.sweep.folder import register_sweep_resolver
+from raytran.setting_limits import check_settings
 
 _FULL_ERROR = "HYDRA_FULL_ERROR"
 """Hydra's own switch: with it set to 1, errors are shown at length."""
@@ -263,6 +264,7 @@ def typed_config_dir(hydra_config: Any) -> list[str]:
 def run_or_exit(function: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
     """Return ``function(cfg)``; a mistake of the user's becomes a sentence on stderr and exit code 1."""
     try:
+        check_settings(OmegaConf.to_container(cfg, resolve=False))  # type: ignore[arg-type]
         return function(cfg)
     except RaytranError as error:
         _exit_with(error)

@@ -21,6 +21,7 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler
 from raytran.data.augment import Augmentation
 from raytran.data.collate import collate_scenes
 from raytran.data.workers import become_worker
+from raytran.setting_limits import check_settings
 from raytran.structs import SceneBatch, TensorStruct
 from raytran.training.scene_stream import SceneStream
 
@@ -50,6 +51,9 @@ class SceneDataModule(pl.LightningDataModule):
         augmentation: random changes of training scenes; validation scenes are never changed.
         seed: of the order of the scenes.
         name: of the data set, for results and for ``init_from=auto``; None if it has none.
+
+    Raises:
+        ConfigError: a number is beyond what it can mean.
     """
 
     def __init__(
@@ -68,6 +72,15 @@ class SceneDataModule(pl.LightningDataModule):
         name: str | None = None,
     ) -> None:
         super().__init__()
+        check_settings(
+            {
+                "num_views": num_views,
+                "val_views": val_views,
+                "batch_size": batch_size,
+                "num_workers": num_workers,
+                "seed": seed,
+            }
+        )
         self.root = Path(root)
         self.name = name
         self._dataset = dataset

@@ -8,6 +8,7 @@ import io
 import logging
 import os
 import secrets
+from collections.abc import Iterator, Mapping
 from netrc import NetrcParseError, netrc
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from raytran.data.files import write_text
 from raytran.errors import ConfigError
+from raytran.limits import MAX_STEPS
 
 _log = logging.getLogger(__name__)
 
@@ -111,7 +113,7 @@ class MetricsTable(Logger):
         """Forget what was logged at ``step`` and later: the run does these steps again."""
         if not self.path.is_file():
             return
-        rows = [row for row in self._read() if int(row["step"]) < step]
+        rows = [row for row in self._read() if (_step_of(row) or 0) < step]
         self._rewrite(rows)
 
     def _append(self, rows: list[dict[str, Any]]) -> None:
@@ -155,8 +157,30 @@ def _read_table(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
     lines = [line for line in text.splitlines(keepends=True) if line.endswith("\n") and "\0" not in line]
     table = csv.DictReader(lines, restkey=_WITHOUT_COLUMN)
     columns = list(table.fieldnames or ())
-    rows = [{name: row[name] for name in columns} for row in table]
-    return columns, [row for row in rows if (row.get("step") or "").isdecimal()]
+    rows = [{name: row[name] for name in columns} for row in _rows(table)]
+    return columns, [row for row in rows if _step_of(row) is not None]
+
+
+def _rows(table: csv.DictReader[str]) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a table up to a damage: they are for pictures, and no run should end for one."""
+    try:
+        yield from table
+    except csv.Error as error:
+        _log.warning("the rest of the logged values is not read: %s", error)
+
+
+def _step_of(row: Mapping[str, Any]) -> int | None:
+    """Return the step of a row, None if it is damaged."""
+    step = _number(row.get("step"))
+    return int(step) if step is not None and 0 <= step <= MAX_STEPS else None
+
+
+def _number(cell: Any) -> float | None:
+    """Return the number in a cell, None if there is none; a loss may be infinite."""
+    try:
+        return float(cell)
+    except (TypeError, ValueError):
+        return None
 
 
 def read_history(folder: Path) -> dict[str, list[tuple[int, float]]]:
@@ -168,8 +192,9 @@ def read_history(folder: Path) -> dict[str, list[tuple[int, float]]]:
     history: dict[str, dict[int, float]] = {}
     for row in _read_table(folder / METRICS)[1]:
         for name, value in row.items():
-            if name not in ("step", "epoch") and value:
-                history.setdefault(name, {})[int(row["step"])] = float(value)
+            number = _number(value)
+            if name not in ("step", "epoch") and number is not None:
+                history.setdefault(name, {})[int(row["step"])] = number
     return {name: sorted(values.items()) for name, values in history.items()}
 
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from raytran.data.prepare.targets import check_disk, write_masks
 from raytran.data.scan import OpenScan
 from raytran.data.scannet.find import ScanSource
 from raytran.data.scannet.scan import read_scan
+from raytran.data.text import read_json_object
 from raytran.data.views import choose_even
 from raytran.errors import ConfigError, DataError
 from raytran.geometry.camera import Cameras
@@ -106,10 +106,10 @@ def read_facts(output: Path, scene_id: str) -> dict[str, Any]:
     """
     path = scan_folder(output, scene_id) / FACTS
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        return read_json_object(path)
+    except DataError as error:
         raise DataError(
-            f"cannot read {path} ({error}): remove the folder of that scan and give the same command again"
+            f"{error}; or remove the folder of that scan and give the same command again"
         ) from error
 
 

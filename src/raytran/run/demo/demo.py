@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,7 +20,9 @@ from raytran.checkpoints.load import load_model, prediction_settings
 from raytran.checkpoints.network import own_packages
 from raytran.data.files import SettingsRecord, write_json
 from raytran.data.locks import exclusive_lock
-from raytran.errors import ConfigError
+from raytran.data.text import read_json_object
+from raytran.errors import ConfigError, DataError
+from raytran.limits import SECONDS, as_number
 from raytran.model import RayTran
 from raytran.run.demo.page import COLUMNS, ShownScene, headline, write_page
 from raytran.run.entry import compose
@@ -223,9 +224,12 @@ class StepTimes:
 
     def __init__(self, path: Path) -> None:
         self._path = path
+        self.seconds: dict[str, float]
         try:
-            self.seconds: dict[str, float] = json.loads(path.read_text())
-        except (OSError, ValueError):
+            self.seconds = {
+                name: as_number(value, SECONDS, name) for name, value in read_json_object(path).items()
+            }
+        except DataError:
             # Times are only shown, nothing depends on them.
             self.seconds = {}
 
