@@ -330,9 +330,9 @@ def _cameras(arrays: Mapping[str, NDArray[Any]], image_size: Any, count: int) ->
     poses = as_numbers(arrays["world_from_camera"], (count, 4, 4), MATRIX_ENTRY, "world_from_camera")
     if (intrinsics[:, [0, 1], [0, 1]] < FOCAL_LENGTH.low).any() or not are_rigid(poses).all():
         raise ValueError("a camera is none that can be")
-    picture = arrays.get("picture")
-    if picture is not None:
-        picture = torch.from_numpy(as_numbers(picture, (count, 4), PIXEL, "picture"))
+    picture = None
+    if "picture" in arrays:
+        picture = torch.from_numpy(as_numbers(arrays["picture"], (count, 4), PIXEL, "picture"))
     return Cameras(torch.from_numpy(intrinsics), torch.from_numpy(poses), (height, width), picture)
 
 
