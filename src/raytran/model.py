@@ -258,7 +258,7 @@ class RayTran(nn.Module):
         voxels, _ = self._run_backbone(views, grid, False, views_at_once)
         count = cameras.intrinsics.shape[1]
         for start in range(0, count, views_at_once or max(count, 1)):
-            chunk = cameras[:, start : start + (views_at_once or count)]
+            chunk = cameras.select(slice(start, start + (views_at_once or count)))
             yield self._render(voxels, grid, chunk)[0].float().sigmoid()
 
     @torch.no_grad()

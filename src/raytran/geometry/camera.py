@@ -79,6 +79,10 @@ class Cameras:
         picture = None if self.picture is None else self.picture[index]
         return Cameras(self.intrinsics[index], self.world_from_camera[index], self.image_size, picture)
 
+    def select(self, views: slice) -> Cameras:
+        """Return some of the N cameras of each scene, both of leading shape ``(B, N)``."""
+        return self[:, views]
+
     def to(self, target: torch.device | torch.dtype | str) -> Cameras:
         """Return the cameras on another device or in another floating-point type."""
         picture = None if self.picture is None else self.picture.to(target)
