@@ -118,8 +118,8 @@ def test_a_process_and_its_workers_end_with_the_parent_and_say_so():
     began = time.monotonic()
     _, said = parent.communicate(timeout=60)  # until all have closed what they inherited
     assert said == "raytran: the first has ended\n"
-    assert time.monotonic() - began < 5
-    assert not any(is_running(pid) for pid in pids)
+    while any(is_running(pid) for pid in pids):
+        assert time.monotonic() - began < 5
 
 
 def test_a_process_whose_parent_has_ended_before_it_looks_ends_too():

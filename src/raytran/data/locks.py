@@ -226,7 +226,7 @@ def _acquire(path: Path) -> _Lock | None:
     while True:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+            descriptor = _open(path)
         except FileNotFoundError:  # the folder was removed meanwhile
             continue
         except OSError as error:
@@ -247,6 +247,13 @@ def _acquire(path: Path) -> _Lock | None:
             _write_holder(descriptor)
             return _Lock(descriptor, (path,))
         os.close(descriptor)  # that of a holder who has removed it
+
+
+def _open(path: Path) -> int:
+    try:
+        return os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    except PermissionError:  # another user's, who holds it
+        return os.open(path, os.O_RDONLY)
 
 
 def _is_still(path: Path, descriptor: int) -> bool:
