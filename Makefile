@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-fast test-nightly lint format docs notebooks resolve clean
+.PHONY: help install demo test test-fast test-nightly fuzz lint format docs notebooks resolve clean
 
 help:  ## Show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1|\2/' | column -t -s '|'
@@ -33,6 +33,9 @@ test-fast: install  ## Run the tests that take less than ten seconds each
 
 test-nightly: install  ## Run the tests of the night, which take minutes each
 	OMP_NUM_THREADS=1 RAYTRAN_TEST_KILLS=10 $(BIN)/pytest -m nightly
+
+fuzz: install  ## Give all readers 10,000 damaged and hostile inputs (one core, some 15 minutes; finds go to fuzz-findings/)
+	OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz --inputs 10000 --seed $${SEED:-0}
 
 lint: install  ## Check format, style and types
 	$(BIN)/ruff format --check src tests benchmarks docs notebooks

@@ -17,7 +17,8 @@ PICTURE = Path(__file__).with_suffix(".png")
 
 COLUMNS: tuple[dict[str, str], ...] = (
     {"structs": "batch, output,\nprediction", "errors": "one sentence\neach"},
-    {"limits": "what numbers\ncan mean"},
+    {"limits": "what numbers\ncan mean", "tensor_archive": "files of torch.save,\nuntrusted"},
+    {"setting_limits": "what settings\ncan mean"},
     {"geometry": "cameras, boxes,\nvoxel grid"},
     {"ops": "rays, pairs,\nsparse attention"},
     {"backbone": "images → voxels", "heads": "voxels → answers"},

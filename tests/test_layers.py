@@ -10,7 +10,8 @@ import pytest
 
 LAYERS: list[set[str]] = [
     {"structs", "errors"},
-    {"limits"},
+    {"limits", "tensor_archive"},
+    {"setting_limits"},
     {"geometry"},
     {"ops"},
     {"backbone", "heads"},

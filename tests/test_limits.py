@@ -27,7 +27,7 @@ def test_number_within_its_bounds_comes_back_as_a_float(value):
 @pytest.mark.parametrize("value", NO_NUMBERS)
 def test_what_is_no_length_ends_in_one_short_sentence(value):
     with pytest.raises(
-        DataError, match="width of box 3 is .*, not a length in metres of 1e-06 to 10000"
+        DataError, match=r"width of box 3 is .*, not a length in metres of 1e-06 to 10000"
     ) as e:
         as_number(value, BOX_SIDE, "width of box 3")
     assert len(str(e.value)) < 200

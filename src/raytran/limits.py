@@ -13,10 +13,16 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from raytran.errors import DataError
+from raytran.errors import DataError, RaytranError
 
 MAX_SIDE = 8192
 """Most pixels along a side of an image that is decoded: a few bytes can claim any number."""
+
+MAX_VIEWS = 100_000
+"""Most frames of a scan, or views that a network is given."""
+
+MAX_STEPS = 10**9
+"""Most steps of a training."""
 
 _SHOWN = 40
 """Characters of a wrong value that a message shows."""
@@ -40,6 +46,20 @@ POSITION = Quantity("a position", -1e6, 1e6)
 """Coordinate in a world, in its unit. In millimetres that is a kilometre; positions on the globe, of millions
 of metres, would lose their centimetres in float32."""
 
+COORDINATE = Quantity("a coordinate of a mesh", -1e9, 1e9)
+"""In the unit of its file, which may be a micrometre."""
+
+VOXEL_CUBE = Quantity("a side of a cube of voxels", 1e-12, 1e9)
+
+HALF_EXTENT = Quantity("half a length of a box", 0, 1e4)
+"""Of a CAD model's box, in its unit; a flat sheet has none along one axis."""
+
+QUATERNION = Quantity("a part of a quaternion", -1e6, 1e6)
+"""Of any length: the evaluation scripts take them as they are."""
+
+CAD_SCALE = Quantity("a scale of a CAD model", -1e4, 1e4)
+"""As annotated: negative for a mirrored model, almost 0 for one that is left out."""
+
 BOX_SIDE = Quantity("a length in metres", 1e-6, 1e4)
 """Side of an object's box."""
 
@@ -47,11 +67,12 @@ MATRIX_ENTRY = Quantity("an entry of a transformation", -1e6, 1e6)
 """Entry of a matrix that rotates, scales and shifts."""
 
 SCALE = Quantity("a positive scale", 1e-6, 1e6)
-"""Factor between two units or of a CAD model."""
+"""Factor between two units, or of a predicted CAD model."""
 
 SCORE = Quantity("a score", -1e6, 1e6)
 """Confidence; only its order counts, and programs write logits too."""
 
+SHARE = Quantity("a share", 0, 1)
 FOCAL_LENGTH = Quantity("a focal length in pixels", 1e-2, 1e7)
 PIXEL = Quantity("a pixel coordinate", -1e6, 1e6)
 SIDE = Quantity("a number of pixels", 1, MAX_SIDE)
@@ -62,26 +83,29 @@ TIMESTAMP = Quantity("a time stamp", -1e20, 1e20)
 """Time since any moment in seconds, or in milli-, micro- or nanoseconds since 1970."""
 
 
-def as_number(value: object, quantity: Quantity, what: str) -> float:
+def as_number(
+    value: object, quantity: Quantity, what: str, *, error: type[RaytranError] = DataError
+) -> float:
     """Return a value that is a number within the bounds of what it measures.
 
     Args:
         value: what a file or setting holds, of any type.
         quantity: what it measures.
         what: name of the value and its place, e.g. ``fx in cameras.json``.
+        error: what to raise.
 
     Raises:
         DataError: it is no number, not finite, or out of bounds.
     """
     number = _as_float(value)
     if not quantity.low <= number <= quantity.high:  # also if it is not a number
-        raise DataError(
+        raise error(
             f"{what} is {shown(value)}, not {quantity.name} of {quantity.low:g} to {quantity.high:g}: mend it"
         )
     return number
 
 
-def as_count(value: object, low: int, high: int, what: str) -> int:
+def as_count(value: object, low: int, high: int, what: str, *, error: type[RaytranError] = DataError) -> int:
     """Return a value that is a whole number from ``low`` to ``high``; 4.0 is one, 4.5, "4" and True are none.
 
     Raises:
@@ -89,7 +113,7 @@ def as_count(value: object, low: int, high: int, what: str) -> int:
     """
     number = _as_float(value)
     if not (low <= number <= high and number == int(number)):
-        raise DataError(f"{what} is {shown(value)}, not a whole number from {low} to {high}: mend it")
+        raise error(f"{what} is {shown(value)}, not a whole number from {low} to {high}: mend it")
     return int(number)
 
 

@@ -86,7 +86,7 @@ def test_a_log_is_read(walk, name):
     else:
         assert (source.axes, source.up) == ("opengl", (0.0, 1.0, 0.0))
         np.testing.assert_allclose(poses @ OPENGL, Y_UP @ walk.poses, atol=1e-9)
-    assert scan.intrinsics.numpy()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist() == list(walk.camera)
+    assert scan.intrinsics[0].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist() == list(walk.camera)
     assert [int(scan.read_color(n)[0, 0, 0]) for n in (0, 10)] == [0, 200]
 
 

@@ -23,7 +23,7 @@ def test_cameras_and_images_are_those_that_were_written(walk, binary):
     assert scan.scene_id == "walk"
     assert scan.frame_id == tuple(str(n) for n in range(12))
     np.testing.assert_allclose(scan.world_from_camera.numpy(), walk.poses, atol=1e-12)
-    assert scan.intrinsics.numpy()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist() == list(walk.camera)
+    assert scan.intrinsics[0].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist() == list(walk.camera)
     assert scan.image_size == (48, 64)
     assert scan.read_color(7)[0, 0].tolist() == [140] * 3
     assert scan.color_bytes(7) == (walk.folder / "images" / "7.png").read_bytes()
@@ -81,7 +81,7 @@ def test_smaller_copies_of_the_images_scale_the_lens(walk):
     write_colmap(large, walk.folder / "sparse" / "0", binary=False)
     scan = open_recording(read_colmap(walk.folder))
     assert scan.image_size == (48, 64)
-    assert scan.intrinsics[0, 0].item() == pytest.approx(walk.camera[0])
+    assert scan.intrinsics[0, 0, 0].item() == pytest.approx(walk.camera[0])
 
 
 def test_a_lens_that_distorts_is_resampled(walk):
@@ -91,7 +91,7 @@ def test_a_lens_that_distorts_is_resampled(walk):
     scan = open_recording(read_colmap(walk.folder))
     assert scan.color_bytes(0) is None
     assert scan.read_color(5, (24, 32)).shape == (24, 32, 3)
-    assert scan.intrinsics[0, 0].item() > 50
+    assert scan.intrinsics[0, 0, 0].item() > 50
 
 
 @pytest.mark.parametrize("binary", [True, False])
@@ -109,7 +109,7 @@ def test_fisheyes_are_resampled(walk, binary, model, params):
     assert scan.color_bytes(0) is None
     assert scan.read_color(5)[24, 32].tolist() == [100] * 3
     # A fisheye of the same focal length sees more than a pinhole, so no corner is empty without zooming.
-    assert scan.intrinsics[0, 0].item() == 50
+    assert scan.intrinsics[0, 0, 0].item() == 50
 
 
 @pytest.mark.parametrize("binary", [True, False])
@@ -223,7 +223,7 @@ def test_what_is_wrong_in_text_is_named(walk, name, text, message):
     write_colmap(walk, folder, binary=False)
     (folder / name).write_text(text)
     with pytest.raises(DataError, match=message):
-        read_colmap(walk.folder)
+        open_recording(read_colmap(walk.folder))
 
 
 def test_no_model_and_no_images(walk):
@@ -243,6 +243,22 @@ def test_images_of_another_shape_are_refused(walk):
         DataError, match=r"image 0 is 64x48 and its intrinsics .* for 48x64, turned by 90°: give"
     ):
         open_recording(read_colmap(walk.folder))
+
+
+def test_a_focal_length_that_is_off_is_its_own(walk):
+    """A camera per image, as COLMAP makes them by default; one has found another focal length."""
+    folder = walk.folder / "sparse" / "0"
+    write_colmap(walk, folder, binary=False, model="SIMPLE_RADIAL", parameters=[50, 32, 24, 0], cameras=12)
+    lines = (
+        (folder / "cameras.txt")
+        .read_text()
+        .replace("\n7 SIMPLE_RADIAL 64 48 50.0", "\n7 SIMPLE_RADIAL 64 48 56.0")
+    )
+    (folder / "cameras.txt").write_text(lines)
+    scan = open_recording(read_colmap(walk.folder))
+    assert scan.dropped == {}
+    assert scan.intrinsics[:, 0, 0].tolist() == [56.0 if n == 6 else 50.0 for n in range(12)]
+    assert all(scan.color_bytes(n) is not None for n in range(12))
 
 
 @pytest.mark.parametrize(

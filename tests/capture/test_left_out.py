@@ -1,131 +1,109 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A long walk of which a few frames are damaged in every way is read without them, and a table says why."""
+"""The scan that a recording makes: which frames are usable, and what becomes of the others."""
 
 from __future__ import annotations
 
-import json
-import shutil
+import logging
+from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
-from raytran.capture.nerfstudio import read_nerfstudio
-from raytran.capture.recording import open_recording
-from raytran.data.scan import report_dropped
+from raytran.capture.lens import Lens
+from raytran.capture.recording import Frame, Recording, open_recording
 from raytran.errors import DataError
 
-from .forms import OPENGL, transforms, write_transforms
-
-COUNT = 1000
+LENS = Lens((48, 64), (50.0, 51.0), (31.0, 25.0))
 
 
-def damage(frames, folder):
-    """Spoil 30 frames of a list; return the reason for each that is left out."""
-    reasons = {}
-    matrix = {n: np.array(frame["transform_matrix"]) for n, frame in enumerate(frames)}
-    for n in range(0, 12, 4):
-        frames[n]["transform_matrix"] = (matrix[n] @ np.diag([1, 1, -1, 1])).tolist()
-        reasons[n] = "left-handed pose (determinant −1)"
-        frames[n + 1]["transform_matrix"] = (matrix[n + 1] @ np.diag([0.5, 0.5, 0.5, 1])).tolist()
-        reasons[n + 1] = "rotation scaled by 0.5"
-        frames[n + 2]["transform_matrix"] = np.full((4, 4), np.nan).tolist()
-        reasons[n + 2] = "pose is not finite or out of bounds"
-        (folder / f"images/{n + 3}.png").unlink()
-        reasons[n + 3] = "no image"
-    for n in range(500, 512, 4):
-        del frames[n]["transform_matrix"]
-        reasons[n] = "no camera-to-world matrix of numbers"
-        frames[n + 1]["fl_x"] = "wide"
-        reasons[n + 1] = "impossible intrinsics"
-        (folder / f"images/{n + 2}.png").write_bytes(b"no image")
-        reasons[n + 2] = "image cannot be read"
-        frames[n + 3]["transform_matrix"] = np.zeros((4, 4)).tolist()
-        reasons[n + 3] = "pose is all zeros"
-    for n in range(900, 903):
-        skewed = matrix[n].copy()
-        skewed[0, :3] += 0.3
-        frames[n]["transform_matrix"] = skewed.tolist()
-        reasons[n] = "pose is no rigid motion"
-        frames[n + 3]["transform_matrix"][1][3] = 1e300
-        reasons[n + 3] = "pose is not finite or out of bounds"
-    return {str(n): reason for n, reason in reasons.items()}
+def recording(walk, lenses=None, **of_frame):
+    """A recording of the walk; ``of_frame`` are lenses of single frames, by ``n0`` … ``n11``."""
+    lenses = dict.fromkeys(range(12), LENS) | {int(name[1:]): lens for name, lens in of_frame.items()}
+    frames = (Frame(str(n), walk.folder / "images" / f"{n}.png", walk.poses[n], lenses[n]) for n in range(12))
+    return Recording(path=walk.folder / "list.txt", scene_id="walk", frames=tuple(frames))
 
 
-@pytest.fixture
-def long_walk(walk):
-    """A list of 1,000 frames, the walk's again and again."""
-    for n in range(12, COUNT):
-        shutil.copy(walk.folder / "images" / f"{n % 12}.png", walk.folder / "images" / f"{n}.png")
-    shots = transforms(walk)["frames"][::-1]
-    frames = [json.loads(json.dumps(shots[n % 12])) | {"file_path": f"images/{n}.png"} for n in range(COUNT)]
-    return walk, frames
+def picture(walk, number, size):
+    Image.new("RGB", size, (20 * number,) * 3).save(walk.folder / "images" / f"{number}.png")
 
 
-def test_a_table_says_what_was_left_out_and_why(long_walk, caplog):
-    walk, frames = long_walk
-    reasons = damage(frames, walk.folder)
-    scan = open_recording(read_nerfstudio(write_transforms(walk, frames=frames)))
-    assert scan.dropped == reasons
-    kept = [n for n in range(COUNT) if str(n) not in reasons]
-    assert scan.frame_id == tuple(map(str, kept))
-    np.testing.assert_allclose(
-        (scan.world_from_camera @ torch.from_numpy(OPENGL)).numpy(),
-        walk.poses[np.array(kept) % 12],
-        atol=1e-9,
+def test_a_lens_that_is_none_costs_its_own_frame_alone(walk):
+    picture(walk, 8, (300, 300))
+    scan = open_recording(
+        recording(
+            walk,
+            n1=replace(LENS, focal=(-50.0, 51.0)),
+            n2=replace(LENS, focal=(50.0, float("nan"))),
+            n3=replace(LENS, model="RADIAL", distortion=(-44.8, 1017.0)),
+            n4=replace(LENS, model="OPENCV_FISHEYE", distortion=(-3.0, 0.0, 0.0, 0.0)),
+            n5=replace(LENS, center=(6000.0, 25.0)),
+            n6=Lens((64, 48), (50.0, 51.0), (25.0, 31.0)),
+            n7=Lens((64, 64), (50.0, 51.0), (25.0, 31.0)),
+            n9=replace(LENS, size=(0, 64)),
+        )
     )
-    caplog.set_level("INFO")
-    report_dropped(scan)
-    assert caplog.messages[-1].splitlines() == [
-        "walk: left out 30 of 1000 frames",
-        "  6  pose is not finite or out of bounds   2, 6, 10, …",
-        "  3  image cannot be read                  502, 506, 510",
-        "  3  impossible intrinsics                 501, 505, 509",
-        "  3  left-handed pose (determinant −1)     0, 4, 8",
-        "  3  no camera-to-world matrix of numbers  500, 504, 508",
-        "  3  no image                              3, 7, 11",
-        "  3  pose is all zeros                     503, 507, 511",
-        "  3  pose is no rigid motion               900, 901, 902",
-        "  3  rotation scaled by 0.5                1, 5, 9",
-    ]
+    assert scan.frame_id == ("0", "10", "11")
+    assert scan.dropped == {
+        "1": "focal lengths and centre not positive and finite",
+        "2": "focal lengths and centre not positive and finite",
+        "3": "distortion that moves the corners out of the image",
+        "4": "distortion that folds the image",
+        "5": "principal point far outside of the image",
+        "6": "image turned by 90° against its intrinsics",
+        "7": "image of another shape than its intrinsics are for",
+        "8": "image of another shape than its intrinsics are for",
+        "9": "intrinsics for images that have not 1 to 8192 pixels a side",
+    }
+    assert scan.intrinsics[0].tolist() == [[50, 0, 31], [0, 51, 25], [0, 0, 1]]
 
 
 @pytest.mark.parametrize(
-    ("spoil", "message"),
+    ("lens", "message"),
     [
-        (
-            np.diag([1.0, 1, -1, 1]),
-            r"12 left-handed pose \(determinant −1\)\): one axis is mirrored, so negate",
-        ),
-        (np.diag([0.5, 0.5, 0.5, 1]), "12 rotation scaled by 0.5.*: divide the upper left 3x3 of each by it"),
-        (np.diag([np.inf, 1, 1, 1]), "12 pose is not finite or out of bounds.*: tracking was lost"),
-        (np.zeros((4, 4)), "12 pose is all zeros"),
+        (replace(LENS, focal=(0.0, 51.0)), "camera of 0 in .*list.txt has no positive, finite focal lengths"),
+        (Lens((64, 48), (50.0, 51.0), (25.0, 31.0)), "0 is 64x48 and .* for 48x64, turned by 90°: give"),
+        (Lens((518, 518), (420.0, 420.0), (259.0, 259.0)), "image 0 is 64x48 and .* are for 518x518: give"),
+        (replace(LENS, center=(16.0, 12.0)), "the middle of 32x24 and far from that of 64x48"),
+        (replace(LENS, center=(259.0, 259.0)), "far outside of 64x48"),
     ],
 )
-def test_a_fault_of_all_frames_is_named_with_its_remedy(walk, spoil, message):
-    frames = transforms(walk)["frames"]
-    for frame in frames:
-        with np.errstate(invalid="ignore"):
-            frame["transform_matrix"] = (np.array(frame["transform_matrix"]) @ spoil).tolist()
-    with pytest.raises(DataError, match=message) as caught:
-        open_recording(read_nerfstudio(write_transforms(walk, frames=frames)))
-    assert len(str(caught.value).replace(str(walk.folder), "")) < 260
+def test_if_no_lens_fits_the_reason_is_one_sentence(walk, lens, message):
+    with pytest.raises(DataError, match=message) as found:
+        open_recording(recording(walk, **{f"n{n}": lens for n in range(12)}))
+    assert len(str(found.value)) < 300 + len(str(walk.folder))
 
 
-def test_a_table_of_many_reasons_is_cut(walk, caplog):
-    caplog.set_level("INFO")
-    scan = open_recording(read_nerfstudio(write_transforms(walk)))
-    scan.dropped.update({f"f{n}": f"rotation scaled by {n}" for n in range(20)})
-    report_dropped(scan)
-    lines = caplog.messages[-1].splitlines()
-    assert (len(lines), lines[-1]) == (14, "  8  8 more reasons")
-    assert not any(line.endswith(" ") for line in lines)
+def test_most_frames_have_the_centre_of_other_images(walk):
+    """Then those that have it are left out; of a few frames it is what the camera measured."""
+    small = replace(LENS, center=(16.0, 12.0))
+    scan = open_recording(recording(walk, **{f"n{n}": small for n in range(9)}))
+    assert scan.frame_id == ("9", "10", "11")
+    assert set(scan.dropped.values()) == {"intrinsics for images of another size"}
+    assert open_recording(recording(walk, n3=small)).dropped == {}
 
 
-def test_an_image_of_another_kind_is_read(walk):
-    with Image.open(walk.folder / "images" / "3.png") as image:
-        image.save(walk.folder / "images" / "3.webp", lossless=True)
-    (walk.folder / "images" / "3.png").unlink()
-    scan = open_recording(read_nerfstudio(write_transforms(walk)))
-    assert scan.read_color(3)[0, 0].tolist() == [60] * 3
+def test_crops_and_images_that_are_filled_up_are_said(walk, caplog):
+    picture(walk, 3, (48, 64))
+    with caplog.at_level(logging.INFO):
+        scan = open_recording(
+            recording(
+                walk, n3=Lens((64, 48), (51.0, 50.0), (25.0, 31.0)), n5=replace(LENS, center=(50.0, 10.0))
+            )
+        )
+    assert scan.dropped == {}
+    assert caplog.messages == [
+        "walk: 1 of 12 images are of another shape than 64x48 and are filled up to it",
+        "walk: 1 of 12 images have their principal point far from the middle, the first at (50, 10) of "
+        "64x48, and are taken for crops: if they are none, give the intrinsics of the stored images",
+    ]
+
+
+def test_ordinary_frames_are_used_as_they_are_stored(walk, caplog):
+    with caplog.at_level(logging.INFO):
+        scan = open_recording(recording(walk, n2=LENS.scaled_to((96, 128))))
+    assert caplog.messages == []
+    assert (scan.picture, scan.dropped) == (None, {})
+    assert (scan.intrinsics.numpy() == np.array([[50, 0, 31], [0, 51, 25], [0, 0, 1]])).all()
+    for n, name in enumerate(walk.names):
+        assert scan.color_bytes(n) == (walk.folder / "images" / name).read_bytes()

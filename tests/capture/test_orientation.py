@@ -22,7 +22,6 @@ from raytran.capture.orientation import (
 from raytran.capture.recording import open_recording
 from raytran.data.scannet.scan import read_scan
 from raytran.errors import ConfigError
-from raytran.geometry.camera import Cameras
 
 from .forms import OPENGL, write_colmap
 
@@ -239,9 +238,8 @@ def test_images_and_cameras_are_turned_together(scan, quarters):
     row, column = (int(value[0]) for value in np.nonzero(upright.read_color(4)[..., 0]))
     ray = torch.tensor([pixel[1] + 0.5, pixel[0] + 0.5, 1.0], dtype=torch.float64)
     pose = sideways.world_from_camera[4]
-    point = pose[:3, :3] @ torch.linalg.inv(sideways.intrinsics) @ (2 * ray) + pose[:3, 3]
-    cameras = Cameras(upright.intrinsics, upright.world_from_camera[4], upright.image_size)
-    seen, depth = cameras.project(point[None])
+    point = pose[:3, :3] @ torch.linalg.inv(sideways.intrinsics[4]) @ (2 * ray) + pose[:3, 3]
+    seen, depth = upright.cameras[4].project(point[None])
     assert seen[0].tolist() == pytest.approx([column + 0.5, row + 0.5])
     assert depth.item() == pytest.approx(2.0)
 

@@ -137,7 +137,7 @@ def test_images_get_the_poses_of_their_times(walk, folder):
     assert scan.scene_id == "tum"
     assert scan.frame_id[1] == "1305031102.100000"
     np.testing.assert_allclose(scan.world_from_camera.numpy(), walk.poses, atol=1e-9)
-    assert scan.intrinsics.numpy()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist() == list(walk.camera)
+    assert scan.intrinsics[0].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist() == list(walk.camera)
     assert scan.read_color(7)[0, 0].tolist() == [140] * 3
 
 

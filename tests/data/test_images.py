@@ -10,7 +10,17 @@ import pytest
 import torch
 from PIL import Image
 
-from raytran.data.images import decode_image, read_frames, resize, stored_size
+from raytran.data.images import (
+    FILL,
+    box_within,
+    decode_image,
+    fill_up,
+    is_turned,
+    read_frames,
+    resize,
+    stored_size,
+    stored_sizes,
+)
 from raytran.errors import DataError
 
 from ..scan_forms import write_claiming_png
@@ -166,3 +176,58 @@ def test_an_image_that_claims_too_many_pixels_is_not_decoded(tmp_path, side) -> 
         read_image(tmp_path / "a.png", (8, 16))
     with pytest.raises(DataError, match=r"pixels, and at most 8192|can be read"):
         stored_size([tmp_path / "a.png"])
+
+
+@pytest.mark.parametrize(
+    ("size", "canvas", "box"),
+    [
+        ((480, 640), (480, 640), (0, 0, 640, 480)),
+        ((960, 1280), (480, 640), (0, 0, 640, 480)),
+        ((478, 640), (480, 640), (0, 0, 640, 480)),
+        ((640, 480), (480, 640), (140, 0, 500, 480)),
+        ((300, 300), (480, 640), (80, 0, 560, 480)),
+        ((100, 640), (480, 640), (0, 190, 640, 290)),
+        ((1, 8000), (480, 640), (0, 239, 640, 240)),
+    ],
+)
+def test_images_of_another_shape_are_put_into_the_middle(size, canvas, box) -> None:
+    assert box_within(size, canvas) == box
+
+
+def test_what_is_turned_is_no_square() -> None:
+    assert is_turned((640, 480), (480, 640))
+    assert not is_turned((480, 640), (480, 640))
+    assert not is_turned((300, 300), (480, 640))
+    assert not is_turned((300, 300), (500, 500))
+
+
+@pytest.mark.parametrize("image_size", [None, (48, 64), (31, 50), (96, 128), (7, 9)])
+def test_a_picture_keeps_its_place_to_a_fraction_of_a_pixel(image_size) -> None:
+    """A ramp over 30×20 pixels in columns 17 to 49 of 64: its values tell the place of what is shown."""
+    ramp = np.repeat((np.arange(20) * 12.0 + 6)[None, :, None], 30, axis=0).repeat(3, axis=2).astype(np.uint8)
+    height, width = image_size or (48, 64)
+    filled = fill_up(ramp, (17, 0, 49, 48), (48, 64), image_size)
+    assert filled.shape == (height, width, 3)
+    is_fill = (filled == np.array(FILL)).all(axis=2)
+    left, right = 17 * width / 64, 49 * width / 64
+    shown = np.flatnonzero(~is_fill[height // 2])
+    assert (shown[0], shown[-1] + 1) == (np.ceil(left), np.floor(right))
+    column = np.arange(width) + 0.5
+    expected = np.interp((column - left) / (right - left) * 20 - 0.5, np.arange(20), ramp[0, :, 0])
+    inner = shown[1:-1]
+    np.testing.assert_allclose(filled[height // 2, inner, 0], expected[inner], atol=4 if width > 20 else 9)
+
+
+def test_a_picture_narrower_than_a_pixel_shows_nothing() -> None:
+    filled = fill_up(np.zeros((400, 1, 3), np.uint8), (319, 0, 320, 480), (480, 640), (12, 16))
+    assert (filled == np.array(FILL)).all()
+
+
+def test_the_stored_size_is_that_of_most_images(paths) -> None:
+    """Whichever comes first."""
+    for path, size in zip(paths, [(9, 9), (16, 8), (8, 16), (16, 8), (16, 8), (8, 16)], strict=True):
+        Image.new("RGB", size).save(path)
+    write_claiming_png(paths[2], 100_000)
+    paths[5].write_bytes(b"no image")
+    assert stored_size(paths) == (8, 16)
+    assert stored_sizes(paths) == [(9, 9), (8, 16), None, (8, 16), (8, 16), None]

@@ -20,6 +20,8 @@ from raytran.geometry.rotation import (
 )
 from raytran.structs import CLASSES, SYMMETRY_INFINITE
 
+IDENTITY = {"translation": [0, 0, 0], "rotation": [1, 0, 0, 0], "scale": [1, 1, 1]}
+
 
 def objects_of(path, scene_id="scene0000_00"):
     return scene_objects(read_annotations(path)[scene_id])
@@ -99,7 +101,7 @@ def test_files_that_cannot_be_used(tmp_path, write_annotations, cube_entry) -> N
     broken = tmp_path / "broken.json"
     for text in ('[{"id_scan": ', "[" * 100_000):
         broken.write_text(text)
-        with pytest.raises(DataError, match="not valid JSON"):
+        with pytest.raises(DataError, match="no valid JSON"):
             read_annotations(broken)
     broken.write_text('{"scene": 1}')
     with pytest.raises(DataError, match="not a list of scenes"):
@@ -161,3 +163,49 @@ def test_alignments_keep_what_is_degenerate(write_annotations, cube_entry) -> No
     assert len(alignments) == 2
     assert alignments.quaternion.isnan().all(dim=1).tolist() == [True, False]
     assert alignments.annotated_scale.tolist() == [[1, 0, 1], [1, 1, 1]]
+
+
+NONSENSE = [
+    {"translation": (1e300, 0, 0)},
+    {"scale": (1e300, 1, 1)},
+    {"bbox": [10**400, 1, 1]},
+    {"bbox": [-1, 1, 1]},
+    {"bbox": {"x": 1}},
+    {"center": [None] * 3},
+    {"sym": ["__SYM_NONE"]},
+    {"catid_cad": 3001627},
+    {"id_cad": "x" * 10**6},
+    {"id_cad": "\x1b[2J"},
+    {"trs": "none"},
+    {"trs": {}},
+]
+
+
+@pytest.mark.parametrize("fields", NONSENSE)
+def test_nonsense_ends_in_one_short_sentence(write_annotations, cube_entry, fields) -> None:
+    with pytest.raises(DataError, match=r"^entry 0 of .*full_annotations\.json") as error:
+        read_annotations(write_annotations({"a": [cube_entry(**fields)]}))
+    assert len(str(error.value).replace(str(error.value).split(" ")[3], "")) < 250
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        5,
+        None,
+        [],
+        "a",
+        {},
+        {"id_scan": "a"},
+        {"id_scan": "a", "aligned_models": {}, "trs": {}},
+        {"id_scan": ["a"], "aligned_models": [], "trs": IDENTITY},
+        {"id_scan": "a", "aligned_models": [5], "trs": IDENTITY},
+        {"id_scan": "a", "aligned_models": [], "trs": IDENTITY | {"scale": [0, 1, 1]}},
+        {"id_scan": "a", "aligned_models": [], "trs": IDENTITY | {"rotation": [0, 0, 0, 1e-300]}},
+    ],
+)
+def test_entries_of_another_shape_are_named(tmp_path, entry) -> None:
+    path = tmp_path / "full_annotations.json"
+    path.write_text(json.dumps([entry]))
+    with pytest.raises(DataError, match=r"^entry 0 of .*full_annotations\.json"):
+        read_annotations(path)

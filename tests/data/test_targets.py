@@ -21,7 +21,7 @@ from raytran.data.scannet.scan import read_scan
 from raytran.data.shapenet.meshes import read_binvox
 from raytran.data.shapenet.models import read_mesh
 from raytran.data.shapenet.voxelize import voxelize_solid
-from raytran.data.targets import foreground_masks, scene_occupancy, shape_grids
+from raytran.data.targets import _scan_surface, foreground_masks, scene_occupancy, shape_grids
 from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
@@ -295,9 +295,7 @@ class TestForeground:
         objects = scene_objects(read_annotations(root / "scan2cad" / "full_annotations.json")["scene0470_00"])
         paths = sorted((root / "reference" / "amodal_mask").iterdir())
         index = [scan.frame_id.index(path.stem) for path in paths]
-        cameras = Cameras(
-            scan.intrinsics.expand(len(index), 3, 3), scan.world_from_camera[index], scan.image_size
-        )
+        cameras = scan.cameras[index]
         masks = foreground_masks(
             objects, cameras, shapenet_root=root / "shapenet", cache=MaskCache(folder=tmp_path)
         ).numpy()
@@ -306,3 +304,15 @@ class TestForeground:
             expected = np.asarray(Image.open(path)) > 0
             iou = (mask & expected).sum() / (mask | expected).sum()
             assert iou >= 0.98, f"{path.name}: {iou:.4f}"
+
+
+@pytest.mark.parametrize(("height", "corner"), [("inf", 2), ("1e30", 2), ("1", 7), ("1", -1)])
+def test_a_scans_mesh_of_points_that_are_nowhere_is_refused(tmp_path, height, corner):
+    path = tmp_path / "mesh.ply"
+    path.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+        f"0 0 0\n1 0 0\n0 {height} 0\n3 0 1 {corner}\n"
+    )
+    with pytest.raises(DataError, match=r"mesh\.ply"):
+        _scan_surface(path, "")

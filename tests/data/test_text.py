@@ -9,7 +9,7 @@ import threading
 import numpy as np
 import pytest
 
-from raytran.data.text import read_json, read_json_object, read_table, read_text
+from raytran.data.text import as_name, read_json, read_json_object, read_names, read_table, read_text
 from raytran.errors import DataError
 
 TEXT = "1, 2.5;-3e1\r\n# a note\r\n\r\n4 5 6 # ü\r\n"
@@ -75,3 +75,25 @@ def test_pairs_of_escaped_halves_are_text(tmp_path):
     (tmp_path / "file.json").write_text("[1]")
     with pytest.raises(DataError, match="holds a list, not a JSON object"):
         read_json_object(tmp_path / "file.json")
+
+
+@pytest.mark.parametrize("text", ["[{}" + ",{}" * 2_700_000 + "]", "[" + "[]," * 4_000_000 + "1]"])
+def test_json_of_millions_of_values_is_not_built(tmp_path, text):
+    (tmp_path / "file.json").write_text(text)
+    with pytest.raises(DataError, match="holds more than 8,000,000 values"):
+        read_json(tmp_path / "file.json")
+
+
+def test_a_key_that_comes_twice_is_named(tmp_path):
+    (tmp_path / "file.json").write_text('{"a": {"fx": 1, "fy": 2, "fx": 3}}')
+    with pytest.raises(DataError, match="the key 'fx' comes twice"):
+        read_json(tmp_path / "file.json")
+
+
+def test_names_are_short_and_printable(tmp_path):
+    (tmp_path / "names.txt").write_text("scene0000_00\n\nscene0001_00 ü\n")
+    assert read_names(tmp_path / "names.txt") == ["scene0000_00", "scene0001_00", "ü"]
+    for value in ("", "x" * 201, "a\nb", "\x1b[2J", 5, None, ["a"], "\ud800"):
+        with pytest.raises(DataError, match="no name of at most 200 characters") as error:
+            as_name(value, "id_scan")
+        assert str(error.value).isprintable()

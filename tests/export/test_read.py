@@ -161,3 +161,9 @@ def test_rows_of_no_form(tmp_path, rows, said):
 def test_semicolons_of_spreadsheets(tmp_path):
     alignments = read_alignments_csv(write(tmp_path, ROW.replace(",", ";"), ROW.replace(",", ";")))
     assert alignments.scale.tolist() == [[0.5, 0.6, 0.7]] * 2
+
+
+def test_only_the_first_row_may_be_a_header(tmp_path):
+    header = "catid_cad,id_cad,tx,ty,tz,qw,qx,qy,qz,sx,sy,sz"
+    with pytest.raises(DataError, match="line 2: tx is 'tx'"):
+        read_alignments_csv(write(tmp_path, *[header] * 100))

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import errno
+import os
 import subprocess
 import sys
 
@@ -40,6 +42,18 @@ def test_a_missing_setting_is_one_sentence(capsys):
     assert "checkpoint" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG])
+def test_a_full_disk_is_one_sentence(capsys, number):
+    wrapped = ValueError("cannot encode")
+    wrapped.__cause__ = OSError(number, os.strerror(number), "out/a.png")
+    for error in (wrapped, wrapped.__cause__):
+        with pytest.raises(SystemExit) as stop:
+            run_or_exit(raise_error(error), OmegaConf.create())
+        assert stop.value.code == 1
+        (sentence,) = capsys.readouterr().err.splitlines()
+        assert sentence.startswith(f"raytran: cannot write out/a.png ({os.strerror(number)}): make room")
+
+
 def test_a_defect_keeps_its_traceback():
     with pytest.raises(ZeroDivisionError):
         run_or_exit(lambda cfg: 1 / 0, OmegaConf.create())
@@ -49,7 +63,11 @@ def test_a_defect_keeps_its_traceback():
     ("typed", "said"),
     [
         ("learning_speed=3", "learning_speed"),
-        ("model=tinny", "model/tinny"),
+        ("model=tinny", "Could not find 'model/tinny': choose one of laptop, raytran, small, tiny"),
+        ("cache_dir=x", "there is no setting cache_dir: is data.dataset.cache_dir meant?"),
+        ("data.cache_dir=x", "is data.dataset.cache_dir meant?"),
+        ("trainer.maxsteps=3", "is trainer.max_steps meant?"),
+        ("nothing.like.it=3", "there is no setting nothing.like.it: --cfg job lists all"),
         ("seed", "key=value"),
         ("resume=elsewhere.ckpt", "give resume=auto"),
         ("schedule.joint.steps=3", "schedule.joint.steps=3 is called schedule.stage2.steps=3 now"),

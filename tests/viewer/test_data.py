@@ -2,6 +2,11 @@
 from __future__ import annotations
 
 import json
+import pickle
+import tracemalloc
+import zipfile
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +25,7 @@ from raytran.viewer.data import (
 )
 
 from ..factories import make_model, make_views
+from .conftest import make_views as make_room_views
 from .conftest import write_result
 
 
@@ -103,6 +109,26 @@ def test_a_result_comes_back_as_it_was_written(result):
     assert len(scene.truth) == 6
     assert [error.found for error in scene.errors] == [True, *[False] * 5]
     assert [error.translation for error in scene.errors] == pytest.approx([0.0, *[0.3] * 5], abs=1e-6)
+
+
+def test_pictures_of_filled_up_frames_come_back(tmp_path):
+    folder, views = write_result(tmp_path / "room"), make_room_views(5, (48, 64))
+    assert read_viewer_scene(folder).cameras.picture is None
+    picture = torch.tensor([14.0, 0.0, 50.0, 48.0]).repeat(1, 5, 1)
+    write_viewer_data(folder, replace(views, picture=picture), list("abcde"), volumes=[])
+    scene = read_viewer_scene(folder)
+    assert torch.equal(scene.cameras.picture, picture[0].double())
+    assert scene.camera(2).picture.tolist() == [14, 0, 50, 48]
+
+
+def test_a_voxel_of_a_filled_up_frame_reads_nothing_beside_its_picture(model):
+    views = make_views(1, 3)
+    part = replace(views, picture=torch.tensor([16.0, 0.0, 32.0, 32.0]).repeat(1, 3, 1))
+    (volume,) = predicted_volumes(model, part, *predict(model, part), grid_extent=model.grid_extent)
+    read = np.diff(volume.reads.offsets).reshape(model.grid_resolution) > 0
+    assert np.array_equal(volume.view_count.numpy() > 0, read)
+    columns = [volume.reads.of_voxel(v).column for v in np.flatnonzero(read.ravel())]
+    assert set(np.concatenate(columns).tolist()) == {1}
 
 
 def test_a_voxel_names_the_pixels_that_read_it(result):
@@ -202,3 +228,72 @@ def test_nothing_to_show(tmp_path):
         find_scenes(tmp_path / "nowhere")
     with pytest.raises(DataError, match=r"holds no scene\.json"):
         find_scenes(tmp_path)
+
+
+def replaced(path: Path, name: str, values: object) -> None:
+    """Write a viewer file again with another array, or with bytes in place of one."""
+    with np.load(path) as file:
+        arrays = dict(file)
+    if isinstance(values, dict):
+        about = json.loads(arrays["about"].tobytes()) | values
+        arrays["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
+    elif not isinstance(values, bytes):
+        arrays[name] = np.asarray(values)
+    np.savez_compressed(path, **arrays)
+    if isinstance(values, bytes):
+        with zipfile.ZipFile(path) as archive:
+            parts = {part: archive.read(part) for part in archive.namelist()}
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            for part, content in (parts | {f"{name}.npy": values}).items():
+                archive.writestr(part, content)
+
+
+HUGE = (
+    b"\x93NUMPY\x01\x00\x76\x00"
+    + b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(118)
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("world_from_camera", HUGE),
+        ("frame0", bytes(200_000_000)),
+        ("frame0", pickle.dumps({})),
+        ("frame0", np.frombuffer(b"GIF89a" + bytes(100), np.uint8)),
+        ("intrinsics", np.full((5, 3, 3), np.nan)),
+        ("intrinsics", np.zeros((5, 3, 3))),
+        ("intrinsics", np.full((5, 3, 3), 1e300)),
+        ("world_from_camera", np.zeros((5, 4, 4))),
+        ("world_from_camera", np.eye(4)),
+        ("world_from_camera", np.array([None])),
+        ("volume0_occupancy", np.zeros(7, np.uint8)),
+        ("volume0_offsets", np.array([0, 5], np.int32)),
+        ("volume0_steps", np.array([-1], np.int32)),
+        ("volume0_weights", np.array([1.5])),
+        ("about", {"image_size": [0, 10]}),
+        ("about", {"image_size": [10**9, 10]}),
+        ("about", {"frame_ids": ["a"] * 10}),
+        ("about", {"frame_ids": [5] * 5}),
+        ("about", {"frame_ids": {"a": 1}}),
+        ("about", {"format": "x" * 10**6}),
+        ("truth_size", np.full((6, 3), np.nan)),
+        ("truth_label", np.full(6, 99)),
+        ("truth_score", np.zeros((6, 6))),
+        ("about", {"volumes": [{"resolution": [-1, 0, 3], "extent": [1, 1, 1], "center": [0, 0, 0]}]}),
+        ("about", {"volumes": [5]}),
+        ("about", {"volumes": [{"resolution": [2, 2, 2], "extent": [1, 1, 1], "center": [0, 0, 1e300]}]}),
+    ],
+)
+def test_nonsense_in_the_viewers_file_is_one_short_sentence(tmp_path, name, values):
+    result = write_result(tmp_path / "room")
+    path = result / "viewer.npz"
+    replaced(path, name, values)
+    tracemalloc.start()
+    try:
+        with pytest.raises(DataError, match=r"cannot read .*viewer\.npz \(.*\): predict again") as error:
+            read_viewer_scene(result)
+        assert tracemalloc.get_traced_memory()[1] < 3e8
+    finally:
+        tracemalloc.stop()
+    assert len(str(error.value).replace(str(path), "PATH")) < 300

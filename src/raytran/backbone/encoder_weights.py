@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TypeVar, cast
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from raytran.errors import CheckpointError
+from raytran.tensor_archive import load_archive
 
 _log = logging.getLogger(__name__)
 
@@ -51,9 +53,15 @@ def read_state(path: Path, *, name: str, remedy: str) -> dict[str, Tensor]:
     if not path.is_file():
         raise CheckpointError(f"no {name} weights at {path}: {remedy}")
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # torch.load raises whatever its unpickler or zip reader meets
-        raise CheckpointError(f"{path} is not a readable state dict ({error}): download it again") from error
+        # Some weights are still in the form from before PyTorch 1.6, which is no archive.
+        if zipfile.is_zipfile(path):
+            state = load_archive(path)
+        else:
+            state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # torch.load raises whatever its unpickler meets
+        raise CheckpointError(
+            f"{path} is not a readable state dict ({str(error)[:80]!r}): download it again"
+        ) from error
     if not isinstance(state, dict) or not all(isinstance(value, Tensor) for value in state.values()):
         raise CheckpointError(f"{path} holds no state dict: give a file of named tensors of {name}")
     return cast("dict[str, Tensor]", state)
@@ -81,7 +89,7 @@ def load_state(
     try:
         network.load_state_dict(fitted)
     except RuntimeError as error:
-        reason = str(error).splitlines()[-1].strip()
+        reason = str(error).splitlines()[-1].strip()[:120]
         raise CheckpointError(
             f"{source} does not fit {name} ({reason}): give a state dict of {name}"
         ) from error

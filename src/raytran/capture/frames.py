@@ -36,7 +36,7 @@ class RawScan:
     Attributes:
         scan: the open scan, which must stay open.
         stored: ``(n, 4, 4)`` float64, the matrices of the pose files.
-        intrinsics: ``(3, 3)`` float64, as stored.
+        intrinsics: ``(n, 3, 3)`` float64, as stored.
         axis_alignment: ``(4, 4)`` float64, aligned_from_world; identity if the scan has none.
     """
 
@@ -124,8 +124,18 @@ def blurred_frames(scan: OpenScan, frames: Sequence[int]) -> NDArray[np.bool_]:
     """
     if not len(frames):
         return np.zeros(0, dtype=np.bool_)
-    values = np.array([sharpness(read_grey(scan, frame, _BLUR_WIDTH)[0]) for frame in frames])
+    values = np.array(
+        [sharpness(_shown(scan, frame, *read_grey(scan, frame, _BLUR_WIDTH))) for frame in frames]
+    )
     return values < _BLURRED * np.median(values)
+
+
+def _shown(scan: OpenScan, frame: int, grey: NDArray[np.float32], factor: float) -> NDArray[np.float32]:
+    """Return the part of a grey image that a frame shows, without what fills it up."""
+    if scan.picture is None:
+        return grey
+    left, top, right, bottom = (scan.picture[frame] * factor).round().long().tolist()
+    return grey[top:bottom, left:right]
 
 
 def _depth_path(scan: OpenScan, frame: int) -> Path | None:

@@ -249,13 +249,27 @@ def frame_lens(
     fy = _focal(entry, "fl_y", "camera_angle_y", size[0], where) if _has_y(entry) else fx
     cx = number(entry, "cx", PIXEL, where, size[1] / 2)
     center = cx, number(entry, "cy", PIXEL, where, size[0] / 2)
-    if model in _PINHOLES or not distorted:
+    if not distorted:
         return check_lens(Lens(size, (fx, fy), center), where)
-    k1, k2, k3, k4 = (number(entry, key, DISTORTION, where, 0.0) for key in ("k1", "k2", "k3", "k4"))
+    # Whatever the camera model: nerfstudio, too, removes the distortion of a PINHOLE that has one.
+    k1, k2, k3, k4, p1, p2 = _distortion(entry, where)
     if is_fisheye:
         return check_lens(Lens(size, (fx, fy), center, "OPENCV_FISHEYE", (k1, k2, k3, k4)), where)
-    p1, p2 = (number(entry, key, DISTORTION, where, 0.0) for key in ("p1", "p2"))
     return opencv_lens(size, (fx, fy), center, (k1, k2, k3, k4), (p1, p2), where)
+
+
+def _distortion(entry: Mapping[str, Any], where: str) -> list[float]:
+    """Return k1, k2, k3, k4, p1, p2: ``distortion_params`` in this order, or one by one; 0 if not given."""
+    names = ("k1", "k2", "k3", "k4", "p1", "p2")
+    if entry.get("distortion_params") is None:
+        return [number(entry, name, DISTORTION, where, 0.0) for name in names]
+    params = numbers(entry, "distortion_params", DISTORTION, where, (-1,)).tolist()
+    # Of fewer than six nobody knows whether the third is k3, as here, or p1, as in OpenCV.
+    if len(params) > len(names) or (len(params) < len(names) and any(params[2:])):
+        raise DataError(
+            f"{where} has {len(params)} distortion_params, not k1, k2, k3, k4, p1, p2: export it again"
+        )
+    return params + [0.0] * (len(names) - len(params))
 
 
 def _has_y(entry: Mapping[str, Any]) -> bool:

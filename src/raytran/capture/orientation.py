@@ -254,7 +254,8 @@ def _with_checked_cameras(
 ) -> tuple[OpenScan, float | None]:
     """Return the scan with the camera axes that its images agree with, and the median distance they show."""
     raw = RawScan.of(scan)
-    reading = check_cameras(raw, match_frames(partial(read_grey, scan), len(scan)))
+    picture = None if scan.picture is None else scan.picture.numpy()
+    reading = check_cameras(raw, match_frames(partial(read_grey, scan), len(scan), picture=picture))
     correction = reading.correction
     is_opengl = correction.storage == "as stored" and np.allclose(correction.camera_rotation, OPENGL)
     other = "opengl" if convention == "opencv" else "opencv"
@@ -433,21 +434,16 @@ def rotate_upright(scan: OpenScan, up: NDArray[np.float64]) -> OpenScan:
     quarters = int(np.argmax([-bottom, right, bottom, -right]))
     if quarters == 0 or max(abs(right), abs(bottom)) < _SIDEWAYS:
         return scan
-    poses = scan.world_from_camera.clone()
-    intrinsics = scan.intrinsics
-    height, width = scan.image_size
+    cameras = scan.cameras
     for _ in range(quarters):
-        # The right side becomes the top: the new x axis is the old y axis, the new y axis the old -x axis.
-        poses = torch.cat([poses[..., 1:2], -poses[..., :1], poses[..., 2:]], dim=-1)
-        fx, fy, cx, cy = (intrinsics[i, j].item() for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
-        intrinsics = torch.tensor([[fy, 0, cy], [0, fx, width - cx], [0, 0, 1]], dtype=torch.float64)
-        height, width = width, height
+        cameras = cameras.quarter_turned()
     return RotatedScan(
         scene_id=scan.scene_id,
         frame_id=scan.frame_id,
-        world_from_camera=poses,
-        intrinsics=intrinsics,
-        image_size=(height, width),
+        world_from_camera=cameras.world_from_camera,
+        intrinsics=cameras.intrinsics,
+        image_size=cameras.image_size,
+        picture=cameras.picture,
         axis_alignment=scan.axis_alignment,
         dropped=scan.dropped,
         damage=scan.damage,

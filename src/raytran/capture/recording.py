@@ -6,6 +6,7 @@ What stands at the end, for the numbers in JSON objects, trusts nothing that a f
 
 from __future__ import annotations
 
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -16,13 +17,25 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from raytran.capture.lens import Lens, check_lens, needs_resampling, resample, shared_pinhole
-from raytran.data.images import decode_image, stored_size
-from raytran.data.scan import NO_IMAGE, OpenScan, none_usable, numbers_first
+from raytran.capture.lens import (
+    Lens,
+    UnfitLens,
+    center_fault,
+    check_lens,
+    needs_resampling,
+    pinhole_of,
+    resample,
+)
+from raytran.data.images import box_within, decode_image, fill_up, has_shape, is_turned, stored_size
+from raytran.data.scan import NO_IMAGE, OTHER_SHAPE, TURNED, OpenScan, none_usable, numbers_first
 from raytran.data.scannet.text import pose_faults
 from raytran.errors import DataError
+from raytran.geometry.camera import is_off_center
 from raytran.limits import Quantity, as_number, as_numbers
+
+_log = logging.getLogger(__name__)
 
 Axes = Literal["opencv", "opengl"]
 """Axes of a camera: x right, y down, z forward; or x right, y up, z backward."""
@@ -34,8 +47,6 @@ NO_ENTRY = "entry is damaged"
 
 Intrinsics = tuple[float, float, float, float]
 """fx, fy, cx, cy of the stored images, pixels, as a user types them."""
-
-_SAME_ASPECT = 0.01
 
 
 @dataclass(frozen=True)
@@ -165,19 +176,20 @@ class ImageFiles(FrameImages):
 
 @dataclass(frozen=True, kw_only=True)
 class RecordedScan(OpenScan):
-    """The usable frames of a recording, all as images of one pinhole camera.
+    """The usable frames of a recording, each as the image of a pinhole camera.
 
     Attributes:
         listed_in: the file that lists the frames.
         images: of the frames, as stored.
         lens: of each frame, for the stored size of its image.
-        pinhole: the camera that ``intrinsics`` describes; images of other lenses are resampled to it.
+        pinhole: of each frame, for the same size; images of lenses that distort are resampled to it. Their
+            ``intrinsics`` are this camera's, for the image brought to ``image_size``.
     """
 
     listed_in: Path
     images: FrameImages
     lens: tuple[Lens, ...]
-    pinhole: Lens
+    pinhole: tuple[Lens, ...]
 
     @property
     def path(self) -> Path:
@@ -187,15 +199,19 @@ class RecordedScan(OpenScan):
     def color_bytes(self, index: int) -> bytes | None:
         """See ``OpenScan``; None for an image that is resampled."""
         lens = self.lens[index]
-        if lens.size != self.image_size or needs_resampling(lens, self.pinhole):
+        if lens.size != self.image_size or needs_resampling(lens, self.pinhole[index]):
             return None
         return self.images.encoded(index)
 
     def read_color(self, index: int, image_size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
         """See ``OpenScan``."""
-        lens = self.lens[index]
-        image = self.images.read(index, image_size or self.image_size, lens.size)
-        return resample(image, lens, self.pinhole) if needs_resampling(lens, self.pinhole) else image
+        lens, pinhole = self.lens[index], self.pinhole[index]
+        is_whole = has_shape(lens.size, self.image_size)
+        image = self.images.read(index, (image_size or self.image_size) if is_whole else None, lens.size)
+        image = resample(image, lens, pinhole) if needs_resampling(lens, pinhole) else image
+        if is_whole:
+            return image
+        return fill_up(image, box_within(lens.size, self.image_size), self.image_size, image_size)
 
     def close(self) -> None:
         """Close the video, if it is one."""
@@ -227,8 +243,10 @@ def build_scan(
 ) -> RecordedScan:
     """Return the scan of a recording.
 
-    Frames without an image and those whose pose is no rigid motion are dropped. A lens for a larger or
-    smaller size of the same image is scaled to the stored one.
+    Frames without an image, those whose pose is no rigid motion, and those whose lens cannot have taken the
+    image are dropped. A lens for a larger or smaller size of the same image is scaled to the stored one. Each
+    frame keeps its own intrinsics; images are brought to the most frequent size, those of another shape
+    filled up.
 
     Args:
         recording: what a reader returned.
@@ -236,33 +254,71 @@ def build_scan(
         open_images: gives the images of the usable frames.
 
     Raises:
-        DataError: no frame is left, an image's aspect is not its lens's, or lenses are of different cameras.
+        ConfigError: a lens distorts and pycolmap is not installed.
+        DataError: no frame is left.
     """
     frames, lenses, dropped = _usable(recording, size_of)
-    if not frames:
-        raise none_usable(recording.path, dropped)
-    pinhole = shared_pinhole(lenses, recording.path)
+    sizes = [lens.size for lens in lenses]
+    image_size = max(sorted(set(sizes)), key=sizes.count)
+    pinholes = [pinhole_of(lens) for lens in lenses]
+    boxes = [box_within(size, image_size) for size in sizes]
+    matrices = [_brought_to(pinhole, box) for pinhole, box in zip(pinholes, boxes, strict=True)]
+    is_whole = all(has_shape(size, image_size) for size in sizes)
+    _report_cameras(recording, lenses, image_size)
     poses = np.array([frame.world_from_camera for frame in frames])
     return RecordedScan(
         scene_id=recording.scene_id,
         listed_in=recording.path,
         frame_id=tuple(frame.name for frame in frames),
         world_from_camera=torch.from_numpy(poses),
-        intrinsics=pinhole.matrix,
-        image_size=pinhole.size,
+        intrinsics=torch.stack(matrices),
+        image_size=image_size,
+        picture=None if is_whole else torch.tensor(boxes, dtype=torch.float64),
         axis_alignment=torch.eye(4, dtype=torch.float64),
         dropped={name: dropped[name] for name in sorted(dropped, key=numbers_first)},
         images=open_images(frames),
         lens=tuple(lenses),
-        pinhole=pinhole,
+        pinhole=tuple(pinholes),
     )
+
+
+def _report_cameras(recording: Recording, lenses: list[Lens], image_size: tuple[int, int]) -> None:
+    """Log how many images are filled up, and how many look like crops."""
+    others = sum(not has_shape(lens.size, image_size) for lens in lenses)
+    if others:
+        _log.info(
+            "%s: %d of %d images are of another shape than %dx%d and are filled up to it",
+            *(recording.scene_id, others, len(lenses), image_size[1], image_size[0]),
+        )
+    cropped = [lens for lens in lenses if is_off_center(lens.center, lens.size)]
+    if cropped:
+        (cx, cy), (height, width) = cropped[0].center, cropped[0].size
+        _log.warning(
+            "%s: %d of %d images have their principal point far from the middle, the first at (%.0f, %.0f) "
+            "of %dx%d, and are taken for crops: if they are none, give the intrinsics of the stored images",
+            *(recording.scene_id, len(cropped), len(lenses), cx, cy, width, height),
+        )
+
+
+def _brought_to(pinhole: Lens, box: tuple[int, int, int, int]) -> Tensor:
+    """Return the ``(3, 3)`` intrinsics of images resized into a box (left, top, right, bottom)."""
+    left, top, right, bottom = box
+    matrix = pinhole.scaled_to((bottom - top, right - left)).matrix
+    matrix[0, 2] += left
+    matrix[1, 2] += top
+    return matrix
 
 
 def _usable(
     recording: Recording, size_of: Callable[[Frame], tuple[int, int] | str]
 ) -> tuple[list[Frame], list[Lens], dict[str, str]]:
-    """Return the usable frames in the order of their names, their lenses, and the reasons for the others."""
+    """Return the usable frames in the order of their names, their lenses, and the reasons for the others.
+
+    Raises:
+        DataError: there is none.
+    """
     dropped = dict(recording.dropped)
+    unfit: dict[str, UnfitLens] = {}
     frames: list[Frame] = []
     lenses: list[Lens] = []
     ordered = sorted(recording.frames, key=lambda frame: numbers_first(frame.name))
@@ -271,22 +327,52 @@ def _usable(
         size = size_of(frame) if fault is None else fault
         if isinstance(size, str):
             dropped[frame.name] = size
-        else:
-            frames.append(frame)
+            continue
+        try:
             lenses.append(_lens_for_size(frame, size, recording.path))
-    return frames, lenses, dropped
+            frames.append(frame)
+        except UnfitLens as error:
+            unfit[frame.name] = error
+    # Where most images have it there, a principal point far from the middle is a mistake.
+    off_center = [
+        center_fault(lens, _camera_of(frame, recording.path))
+        for frame, lens in zip(frames, lenses, strict=True)
+    ]
+    if sum(fault is not None for fault in off_center) > len(frames) / 2:
+        unfit |= {
+            frame.name: fault for frame, fault in zip(frames, off_center, strict=True) if fault is not None
+        }
+        lenses = [lens for lens, fault in zip(lenses, off_center, strict=True) if fault is None]
+        frames = [frame for frame, fault in zip(frames, off_center, strict=True) if fault is None]
+    dropped |= {name: error.reason for name, error in unfit.items()}
+    if frames:
+        return frames, lenses, dropped
+    if len(unfit) > len(dropped) / 2:
+        raise next(iter(unfit.values()))
+    raise none_usable(recording.path, dropped)
 
 
 def _lens_for_size(frame: Frame, size: tuple[int, int], listed_in: Path) -> Lens:
-    """Return the frame's lens for the stored size ``(H, W)`` of its image."""
+    """Return the frame's lens for the stored size ``(H, W)`` of its image.
+
+    Raises:
+        UnfitLens: it is none, or one for images of another shape.
+    """
     height, width = frame.lens.size
-    if abs((size[1] / size[0]) / (width / height) - 1) > _SAME_ASPECT:
-        rotated = ", turned by 90°" if (size[1] > size[0]) != (width > height) else ""
-        raise DataError(
+    if min(height, width) > 0 and not has_shape(size, frame.lens.size):
+        turned = is_turned(size, frame.lens.size)
+        raise UnfitLens(
             f"image {frame.name} is {size[1]}x{size[0]} and its intrinsics in {listed_in} are for "
-            f"{width}x{height}{rotated}: give the images that the intrinsics were made for"
+            f"{width}x{height}{', turned by 90°' if turned else ''}: give the images that the intrinsics "
+            "were made for",
+            TURNED if turned else OTHER_SHAPE,
         )
-    return check_lens(frame.lens.scaled_to(size), f"the camera of {frame.name} in {listed_in}")
+    lens = frame.lens.scaled_to(size) if min(height, width) > 0 else frame.lens
+    return check_lens(lens, _camera_of(frame, listed_in))
+
+
+def _camera_of(frame: Frame, listed_in: Path) -> str:
+    return f"the camera of {frame.name} in {listed_in}"
 
 
 def typed_lens(intrinsics: Intrinsics, size: tuple[int, int]) -> Lens:

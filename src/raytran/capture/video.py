@@ -116,6 +116,8 @@ class VideoFile:
         if not self._container.streams.video:
             raise DataError(f"{self.path} has no pictures, only other streams: give a video")
         stream = self._container.streams.video[0]
+        if stream.codec_context is None:  # FFmpeg knows of no decoder
+            raise DataError(f"{self.path} has pictures of a kind that FFmpeg cannot decode: export it again")
         width, height = stream.codec_context.width, stream.codec_context.height
         if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
             raise DataError(

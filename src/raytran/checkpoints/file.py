@@ -15,8 +15,8 @@ import json
 import logging
 import os
 import pickle
-import zipfile
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,10 @@ import raytran
 from raytran.checkpoints.earlier import upgraded
 from raytran.checkpoints.network import without_sources
 from raytran.data.files import UNFINISHED, whole_file
+from raytran.data.text import parse_json
 from raytran.errors import CheckpointError, ConfigError
+from raytran.limits import MAX_STEPS, shown
+from raytran.tensor_archive import load_archive
 
 _log = logging.getLogger(__name__)
 
@@ -108,15 +111,14 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def _read_torch_file(path: Path) -> dict[str, Any]:
-    _check_bytes(path)
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        content = load_archive(path)
     except pickle.UnpicklingError as error:
         raise CheckpointError(
             f"{path} was not loaded: it holds more than tensors and plain values, which no checkpoint of "
             "raytran does; do not use this file"
         ) from error
-    except Exception as error:  # a made-up file can fail anywhere in the reader
+    except (ValueError, OSError) as error:
         raise _damaged(path) from error
     check_content(content, path)
     return content
@@ -146,19 +148,6 @@ def read_newest(folder: Path) -> tuple[Path, dict[str, Any]] | None:
     return None
 
 
-def _check_bytes(path: Path) -> None:
-    """Compare every part of the file with its check sum, which PyTorch itself does not."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            # PyTorch compresses nothing; what is small here and huge in memory is not from it.
-            if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
-                raise CheckpointError(f"{path} is no checkpoint of raytran: it is a compressed archive")
-            if archive.testzip() is not None:
-                raise _damaged(path)
-    except (zipfile.BadZipFile, OSError, EOFError, NotImplementedError, ValueError) as error:
-        raise _damaged(path) from error
-
-
 def _damaged_weights(path: Path) -> DamagedCheckpointError:
     return DamagedCheckpointError(
         f"cannot read {path}: the file is damaged, cut short or no safetensors file; take another copy "
@@ -176,7 +165,60 @@ def _damaged(path: Path) -> DamagedCheckpointError:
 FORMAT = "raytran.checkpoint/2"
 EARLIER_FORMAT = "raytran.checkpoint/1"
 
-_REQUIRED = {"stage": str, "preset": str, "model": dict, "views": dict, "state_dict": dict}
+_NAME = re.compile(r"\w[\w./+-]{0,99}")
+"""Names of presets and stages, which become words of a command."""
+
+
+def _is_name(value: Any) -> bool:
+    return isinstance(value, str) and _NAME.fullmatch(value) is not None and ".." not in value
+
+
+def _is_object(value: Any) -> bool:
+    return isinstance(value, dict) and all(isinstance(name, str) for name in value)
+
+
+def _is_texts(value: Any) -> bool:
+    return isinstance(value, list | tuple) and all(isinstance(text, str) for text in value)
+
+
+def _is_step(value: Any) -> bool:
+    return isinstance(value, int) and 0 <= value <= MAX_STEPS
+
+
+def _is_parent(value: Any) -> bool:
+    return _is_object(value) and _is_name(value.get("stage")) and _is_step(value.get("step"))
+
+
+def _is_scores(value: Any) -> bool:
+    return _is_object(value) and all(isinstance(score, int | float) for score in value.values())
+
+
+def _is_data(value: Any) -> bool:
+    texts = ("name", "root", "annotation")
+    return (
+        _is_object(value)
+        and all(isinstance(value.get(name), str | None) for name in texts)
+        and isinstance(value.get("made"), dict | None)
+    )
+
+
+_REQUIRED: dict[str, Callable[[Any], bool]] = {
+    "stage": _is_name,
+    "preset": _is_name,
+    "model": _is_object,
+    "views": _is_object,
+    "state_dict": _is_object,
+}
+_OPTIONAL: dict[str, Callable[[Any], bool]] = {
+    "config": _is_object,
+    "data": _is_data,
+    "parent": _is_parent,
+    "scores": _is_scores,
+    "versions": _is_object,
+    "warnings": _is_texts,
+    "global_step": _is_step,
+    "git_commit": lambda value: isinstance(value, str),
+}
 
 
 class DamagedCheckpointError(CheckpointError):
@@ -199,12 +241,18 @@ def check_content(content: Any, path: Path) -> None:
                 "update raytran"
             )
     if found not in (FORMAT, EARLIER_FORMAT):
-        raise CheckpointError(f"{path} is no checkpoint of raytran: expected format {FORMAT}, got {found}")
-    for name, kind in _REQUIRED.items():
-        if not isinstance(content.get(name), kind):
+        raise CheckpointError(
+            f"{path} is no checkpoint of raytran: expected format {FORMAT}, got {shown(found)}"
+        )
+    for name, is_proper in _REQUIRED.items():
+        if not is_proper(content.get(name)):
             raise CheckpointError(f"{path} is no whole checkpoint of raytran: it has no proper '{name}'")
+    for name, is_proper in _OPTIONAL.items():
+        if content.get(name) is not None and not is_proper(content[name]):
+            raise CheckpointError(f"{path} is no checkpoint of raytran: its '{name}' is damaged")
     if not all(
-        isinstance(name, str) and isinstance(value, Tensor) for name, value in content["state_dict"].items()
+        isinstance(value, Tensor) and value.layout is torch.strided and not value.is_complex()
+        for name, value in content["state_dict"].items()
     ):
         raise CheckpointError(f"{path} is no checkpoint of raytran: some of its weights are no tensors")
 
@@ -215,6 +263,10 @@ PREFIX = "model."
 
 _MAX_METADATA = 1 << 20
 """Characters of the header's JSON at most; those of the presets have some 3,000."""
+
+
+_MAX_TENSORS = 100_000
+"""Tensors in a file at most; the presets have some hundred."""
 
 
 def is_weights_file(path: Path) -> bool:
@@ -270,7 +322,10 @@ def read_weights(path: Path) -> dict[str, Any]:
         with safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
             metadata = _parse(header.get("raytran"))
-            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 - no mapping
+            names = file.keys()
+            if len(names) > _MAX_TENSORS:
+                raise ValueError(f"it has {len(names)} tensors")
+            weights = {name: file.get_tensor(name) for name in names}
     except Exception as error:  # a made-up file can fail anywhere in the reader
         raise _damaged_weights(path) from error
     if metadata is None:
@@ -289,7 +344,7 @@ def _parse(text: str | None) -> dict[str, Any] | None:
     """Return the metadata in a header, None if there is none."""
     if text is None or len(text) > _MAX_METADATA:
         return None
-    metadata = json.loads(text)
+    metadata = parse_json(text, "its header")
     return metadata if isinstance(metadata, dict) else None
 
 

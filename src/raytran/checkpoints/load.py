@@ -13,9 +13,13 @@ import torch
 from raytran.checkpoints.file import PREFIX, checkpoint_path, read_checkpoint
 from raytran.checkpoints.metadata import input_mask
 from raytran.checkpoints.network import build_network
-from raytran.errors import CheckpointError
+from raytran.errors import CheckpointError, DataError
+from raytran.limits import MAX_VIEWS, SIDE, as_count, as_numbers, shown
 from raytran.model import RayTran
 from raytran.ops.traverse import Attention, RayTracer
+
+_MAX_REASON = 120
+"""Characters of PyTorch's reason that a message shows: it may list all names of a file."""
 
 
 def load_model(
@@ -71,10 +75,12 @@ def prediction_settings(checkpoint: str | Path) -> PredictionSettings:
     metadata = read_checkpoint(path)
     views = metadata["views"]
     try:
-        height, width = map(int, views["image_size"])
-        num_views = int(views["predict_views"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(f"{path} does not say which images its network wants: it is damaged") from error
+        height, width = as_numbers(views.get("image_size"), (2,), SIDE, "image_size").astype(int).tolist()
+        num_views = as_count(views.get("predict_views"), 1, MAX_VIEWS, "predict_views")
+    except DataError as error:
+        raise CheckpointError(
+            f"{path} does not say which images its network wants ({error}): it is damaged"
+        ) from error
     mask = metadata.get("input_mask") or input_mask(metadata.get("config"))
     return PredictionSettings(metadata["preset"], metadata["stage"], (height, width), num_views, mask)
 
@@ -93,7 +99,9 @@ def model_from(checkpoint: Mapping[str, Any], path: Path, *, trust: Iterable[str
         ConfigError: ``trust`` is no list of packages.
     """
     with torch.device("meta"):  # the file's size, and not what it claims, decides how much memory is taken
-        shell = build_network(checkpoint["model"], path, trust=trust)
+        shell = build_network(
+            checkpoint["model"], path, trust=trust, max_tensors=len(checkpoint["state_dict"])
+        )
     if not isinstance(shell, RayTran):
         raise CheckpointError(f"{path} describes only a part of a network: do not use this file")
     load_weights(shell, checkpoint, path, assign=True)
@@ -120,19 +128,29 @@ def load_weights(
         fresh: parts that keep the weights they have, see ``fresh_parts``.
 
     Raises:
-        CheckpointError: names or shapes differ.
+        CheckpointError: names or shapes differ, or a weight is not finite.
     """
     kept = tuple(f"{part}." for part in fresh)
     state = {name: value for name, value in _state(checkpoint).items() if not name.startswith(kept)}
+    for name, value in state.items():
+        if value.is_floating_point() and not _in_float32(value).isfinite().all():
+            raise CheckpointError(
+                f"{shown(name)} in {path} is not finite: take a checkpoint from before the training diverged"
+            )
     state |= {name: value for name, value in model.state_dict().items() if name.startswith(kept)}
     try:
         model.load_state_dict(state, assign=assign)
     except RuntimeError as error:
-        reason = str(error).splitlines()[-1].strip()
+        reason = str(error).splitlines()[-1].strip()[:_MAX_REASON]
         raise CheckpointError(
             f"the weights in {path} (preset {checkpoint['preset']}) do not fit this model ({reason}): "
             "choose the preset and model settings that the checkpoint was trained with"
         ) from error
+
+
+def _in_float32(value: torch.Tensor) -> torch.Tensor:
+    """Return numbers as those of 32 bits, as they are computed with: of 64, some become infinite by it."""
+    return value if value.dtype in (torch.float32, torch.float16, torch.bfloat16) else value.float()
 
 
 def fresh_parts(model: RayTran, checkpoint: Mapping[str, Any], may_be_missing: Sequence[str]) -> list[str]:

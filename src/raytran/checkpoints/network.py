@@ -10,15 +10,18 @@ from __future__ import annotations
 import functools
 import importlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from contextlib import contextmanager
+from typing import Any
 
 from torch import nn
+from torch.nn.modules.module import (
+    register_module_module_registration_hook,
+    register_module_parameter_registration_hook,
+)
 
 from raytran.errors import CheckpointError, ConfigError
-
-if TYPE_CHECKING:
-    pass
-
+from raytran.limits import shown
+from raytran.setting_limits import check_settings
 
 PARTS: dict[str, str] = {
     "RayTran": "raytran.model",
@@ -46,6 +49,15 @@ _PACKAGE = "raytran"
 
 _NOT_THE_NETWORK = ("attention",)
 """Settings of ours that are not the network's: how it was computed there."""
+
+_MAX_NODES, _MAX_DEPTH, _MAX_TEXT = 10_000, 40, 1000
+"""Values, levels and characters of one text in a description of a network; the presets have some hundred."""
+
+_MAX_NUMBER = 1e6
+"""Largest number in one: of channels, blocks, voxels along a side."""
+
+_MODULES_A_TENSOR = 20
+"""Most modules for each weight: there are containers, and functions without weights."""
 
 _PLAIN = (str, int, float, bool, type(None))
 
@@ -119,7 +131,9 @@ def _with_targets(node: Any, change: Callable[[str], str]) -> Any:
     return [_with_targets(value, change) for value in node] if isinstance(node, list | tuple) else node
 
 
-def build_network(config: Mapping[str, Any], source: object, *, trust: Iterable[str] = ()) -> nn.Module:
+def build_network(
+    config: Mapping[str, Any], source: object, *, trust: Iterable[str] = (), max_tensors: int | None = None
+) -> nn.Module:
     """Return the network that ``config`` describes, without any weights of its own.
 
     A node with ``_target_`` stands for a class of ``PARTS``, or of a package in ``trust``, the other keys for
@@ -130,24 +144,84 @@ def build_network(config: Mapping[str, Any], source: object, *, trust: Iterable[
         config: the config from a checkpoint.
         source: what to name in messages: the file.
         trust: see ``trusted_packages``.
+        max_tensors: number of the weights that are there: a network with more is not built to its end. A few
+            bytes can describe one of a billion blocks.
 
     Raises:
         CheckpointError: the config asks for anything else; that is then neither imported nor run. Or the
-            classes do not take these arguments, or a package in ``trust`` is not installed.
-        ConfigError: see ``trusted_packages``.
+            classes do not take these arguments, or a package in ``trust`` is not installed; or there are
+            fewer weights than the network has.
+        ConfigError: see ``trusted_packages``; or a number is beyond what it can mean.
     """
     trusted = trusted_packages(trust)
+    _check_extent(config, source)
+    check_settings(config, where=f"in {source}: model")
     try:
-        built = _build(config, source, trusted)
+        with _at_most(max_tensors, source):
+            built = _build(config, source, trusted)
     except (TypeError, ValueError, RuntimeError, AttributeError, KeyError, IndexError, MemoryError) as error:
         whose = " or ".join(("raytran", *(name for name in own_packages(config) if name in trusted)))
         raise CheckpointError(
-            f"the network described in {source} cannot be built ({str(error).splitlines()[0]}): "
+            f"the network described in {source} cannot be built ({_first_line(error)}): "
             f"the file is of another version of {whose}, or damaged"
         ) from error
     if not isinstance(built, nn.Module):
         raise CheckpointError(f"{source} describes no network: do not use this file")
     return built
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).partition("\n")[0][:120]
+
+
+def _check_extent(config: Any, source: object) -> None:
+    """Raise if a description is larger than any network's: nothing is built of it then."""
+    left = _MAX_NODES
+    level = [config]
+    for _ in range(_MAX_DEPTH):
+        left -= len(level)
+        if left < 0:
+            raise _odd(source)
+        if any(isinstance(node, int | float) and not abs(node) <= _MAX_NUMBER for node in level):
+            raise _odd(source)
+        if any(isinstance(node, str) and len(node) > _MAX_TEXT for node in level):
+            raise _odd(source)
+        containers = [node for node in level if isinstance(node, Mapping | list | tuple)]
+        if sum(map(len, containers)) > left:
+            raise _odd(source)
+        level = [
+            part for node in containers for part in (node.values() if isinstance(node, Mapping) else node)
+        ]
+        if not level:
+            return
+    raise _odd(source)
+
+
+@contextmanager
+def _at_most(max_tensors: int | None, source: object) -> Iterator[None]:
+    """Stop the making of modules in the block once they have more weights than there are."""
+    if max_tensors is None:
+        yield
+        return
+    left = {"weights": max_tensors, "modules": _MODULES_A_TENSOR * (max_tensors + 1)}
+
+    def count(kind: str, value: object) -> None:
+        left[kind] -= value is not None
+        if left[kind] < 0:
+            raise CheckpointError(
+                f"the network described in {source} has more parts than the file has weights for: the file "
+                "is of another program, or damaged"
+            )
+
+    hooks = [
+        register_module_parameter_registration_hook(lambda _, __, value: count("weights", value)),
+        register_module_module_registration_hook(lambda _, __, value: count("modules", value)),
+    ]
+    try:
+        yield
+    finally:
+        for hook in hooks:
+            hook.remove()
 
 
 def _build(node: Any, source: object, trusted: tuple[str, ...]) -> Any:
@@ -185,12 +259,12 @@ def _class(target: Any, source: object, trusted: tuple[str, ...]) -> type[nn.Mod
         if _is_network(found) and found.__module__.partition(".")[0] in trusted:
             return found
         raise CheckpointError(
-            f"{source} asks for '{target}', and there is no torch.nn.Module of that name in {package}: "
+            f"{source} asks for {shown(target)}, and there is no torch.nn.Module of that name in {package}: "
             f"set PYTHONPATH so that Python finds the {package} it was trained with"
         )
     advice = f", or if you know it and {package} is a package of yours, give trust=[{package}]"
     raise CheckpointError(
-        f"{source} asks to run '{target}', which is no network of raytran: do not use this file"
+        f"{source} asks to run {shown(target)}, which is no network of raytran: do not use this file"
         + (advice if package.isidentifier() and package != _PACKAGE else "")
     )
 

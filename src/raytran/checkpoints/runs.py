@@ -7,7 +7,6 @@ before it while it goes on and, once its last step is done, ``finished.json``.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,8 +15,11 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from raytran.data.files import exclusive_lock, write_json
-from raytran.errors import CheckpointError, ConfigError, RaytranError
+from raytran.data.files import write_json
+from raytran.data.locks import exclusive_lock
+from raytran.data.text import as_name, read_json_object
+from raytran.errors import CheckpointError, ConfigError, DataError, RaytranError
+from raytran.limits import MAX_STEPS, as_count
 
 STAGE_NAMES = {"occupancy": "stage1", "joint": "stage2", "shape": "stage3", "view": "novel_view"}
 """Former name of a stage → its name."""
@@ -60,8 +62,11 @@ def one_at_a_time(folder: Path) -> Iterator[int]:
     Raises:
         ConfigError: one does already.
     """
-    busy = ConfigError(f"another process trains in {folder}: wait for it to end, or stop it, and try again")
-    with exclusive_lock(folder / _LOCK, if_taken=busy) as descriptor:
+
+    def taken(who: str) -> ConfigError:
+        return ConfigError(f"another process trains in {folder} ({who}): wait for it to end, or stop it")
+
+    with exclusive_lock(folder / _LOCK, if_taken=taken) as descriptor:
         yield descriptor
 
 
@@ -91,12 +96,23 @@ def read_finished(folder: Path) -> Finished | None:
     if not path.is_file():
         return None
     try:
-        mark = Finished(**json.loads(path.read_text()))
-        return replace(mark, stage=STAGE_NAMES.get(mark.stage, mark.stage))
-    except (ValueError, TypeError) as error:
+        mark = Finished(**read_json_object(path))
+        _check_mark(mark)
+    except (DataError, TypeError) as error:
         raise CheckpointError(
             f"{path} is damaged: delete it and run that stage again with resume=auto"
         ) from error
+    return replace(mark, stage=STAGE_NAMES.get(mark.stage, mark.stage))
+
+
+def _check_mark(mark: Finished) -> None:
+    """Raise DataError unless every part of a mark is what it should be."""
+    for name in ("stage", "preset", "experiment", "time"):
+        as_name(getattr(mark, name), name)
+    as_count(mark.steps, 0, MAX_STEPS, "steps")
+    checkpoint = Path(as_name(mark.checkpoint, "checkpoint"))
+    if checkpoint.is_absolute() or ".." in checkpoint.parts or not isinstance(mark.data, dict | None):
+        raise DataError("checkpoint leads out of the run's folder, or data is no object")
 
 
 def finished_runs(

@@ -30,7 +30,8 @@ from raytran.data.targets import (
 from raytran.data.views import choose_even, choose_random, hold_out
 from raytran.errors import ConfigError, DataError
 from raytran.geometry.camera import Cameras
-from raytran.geometry.grid import VoxelGrid
+from raytran.geometry.grid import VoxelGrid, checked_grid
+from raytran.setting_limits import check_settings
 from raytran.structs import ObjectSet, SceneBatch, Views
 
 TARGETS: tuple[str, ...] = ("objects", "shapes", "occupancy", "foreground")
@@ -95,7 +96,7 @@ class SceneDataset(Dataset[SceneBatch]):
         seed: of the random frames and of the augmentation.
 
     Raises:
-        ConfigError: unknown targets, or a target whose files are not given.
+        ConfigError: unknown targets, a target whose files are not given, or a number that cannot be.
         DataError: a file or scan is missing, or no scene has objects.
     """
 
@@ -121,6 +122,8 @@ class SceneDataset(Dataset[SceneBatch]):
         seed: int = 0,
     ) -> None:
         _check(targets, annotations, shapenet_root, input_mask=input_mask, object_choice=object_choice)
+        check_settings({"image_size": image_size, "num_views": num_views, "num_new_views": num_new_views})
+        checked_grid(grid_resolution, grid_extent)
         if view_choice not in ("random", "even"):
             raise ConfigError(f"unknown view_choice {view_choice!r}: choose random or even")
         if isinstance(annotations, str | Path):

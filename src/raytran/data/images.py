@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import logging
+import math
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import cache
 from io import BytesIO
@@ -22,6 +24,14 @@ _log = logging.getLogger(__name__)
 
 MIN_VIEWS = 2
 """Fewest different frames from which a scene is reconstructed."""
+
+FILL = (124, 116, 104)
+"""Red, green and blue around a picture of another shape: ImageNet's mean, which encoders take for zero."""
+
+_SAME_ASPECT = 0.01
+"""Relative difference up to which two images have the same aspect: one row or column of a hundred."""
+
+_ROUNDING = 1e-6
 
 _UNREADABLE = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
 """What Pillow raises for files that are truncated, damaged, absurdly large or no images."""
@@ -70,6 +80,74 @@ def decode_image(
 def resize(pixels: NDArray[np.uint8], image_size: tuple[int, int]) -> NDArray[np.uint8]:
     """Resize ``(H, W, 3)`` pixels to ``image_size`` (H, W) as the images of files are."""
     return np.array(Image.fromarray(pixels).resize(image_size[::-1], Image.Resampling.BILINEAR))
+
+
+def has_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether images of two sizes ``(H, W)`` have one aspect, so that one may be the other resized."""
+    return abs((size[1] / size[0]) / (other[1] / other[0]) - 1) <= _SAME_ASPECT
+
+
+def is_turned(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether images of one size ``(H, W)`` have the shape of another's turned by 90°, and not its own."""
+    return has_shape(size, other[::-1]) and not has_shape(size, other)
+
+
+def box_within(size: tuple[int, int], canvas: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Return where images of one size lie when they are brought to another, (left, top, right, bottom).
+
+    Images of the same aspect fill it all. Others keep their aspect: they are scaled until they just fit and
+    put into the middle, to a pixel.
+
+    Args:
+        size: ``(H, W)`` of the images.
+        canvas: ``(H, W)`` to which they are brought.
+    """
+    height, width = canvas
+    if has_shape(size, canvas):
+        return 0, 0, width, height
+    scale = min(height / size[0], width / size[1])
+    h, w = max(1, round(size[0] * scale)), max(1, round(size[1] * scale))
+    left, top = (width - w) // 2, (height - h) // 2
+    return left, top, left + w, top + h
+
+
+def fill_up(
+    pixels: NDArray[np.uint8],
+    box: Sequence[float],
+    canvas: tuple[int, int],
+    image_size: tuple[int, int] | None = None,
+) -> NDArray[np.uint8]:
+    """Return an image of a larger size that shows pixels in a box and ``FILL`` around them.
+
+    Args:
+        pixels: ``(h, w, 3)``.
+        box: left, top, right and bottom of where they come to lie on the canvas.
+        canvas: ``(H, W)``.
+        image_size: ``(H', W')`` to which the canvas is resized; None: as it is.
+
+    Returns:
+        ``(H', W', 3)``. Where the box ends within a pixel, that pixel is filled up.
+    """
+    height, width = image_size or canvas
+    scale_x, scale_y = width / canvas[1], height / canvas[0]
+    left, top, right, bottom = box[0] * scale_x, box[1] * scale_y, box[2] * scale_x, box[3] * scale_y
+    # Whole pixels, and the part of the picture that they show: its place stays exact.
+    x0, y0 = math.ceil(left - _ROUNDING), math.ceil(top - _ROUNDING)
+    x1, y1 = math.floor(right + _ROUNDING), math.floor(bottom + _ROUNDING)
+    image = np.empty((height, width, 3), dtype=np.uint8)
+    image[:] = FILL
+    if x1 > x0 and y1 > y0:
+        rows, columns = pixels.shape[:2]
+        across, down = columns / (right - left), rows / (bottom - top)
+        part = (
+            max((x0 - left) * across, 0.0),
+            max((y0 - top) * down, 0.0),
+            min((x1 - left) * across, columns),
+            min((y1 - top) * down, rows),
+        )
+        shown = Image.fromarray(pixels).resize((x1 - x0, y1 - y0), Image.Resampling.BILINEAR, box=part)
+        image[y0:y1, x0:x1] = np.array(shown)
+    return image
 
 
 def read_frames(
@@ -150,19 +228,42 @@ class _Reader:
 
 
 def stored_size(paths: Sequence[Path]) -> tuple[int, int]:
-    """Return ``(H, W)`` of the first image whose header can be read.
+    """Return the most frequent ``(H, W)`` of the images whose headers can be read.
 
     Raises:
-        DataError: there is none, or it is larger than ``MAX_SIDE``.
+        DataError: there is none, or they are larger than ``MAX_SIDE``.
     """
+    sizes = Counter(size for size in stored_sizes(paths) if size is not None)
+    if not sizes:
+        if paths and paths[0].is_file():
+            _size_of(paths[0])  # It may say why.
+        raise DataError(f"no image in {paths[0].parent} can be read: copy or export them again")
+    return sizes.most_common(1)[0][0]
+
+
+def stored_sizes(paths: Sequence[Path]) -> list[tuple[int, int] | None]:
+    """Return ``(H, W)`` of each image, None where its header cannot be read or claims too many pixels."""
+    sizes: list[tuple[int, int] | None] = []
     for path in paths:
         try:
-            with Image.open(path) as image:
-                _check_sides(image.size, str(path))
-                return image.size[1], image.size[0]
-        except _UNREADABLE:
-            continue
-    raise DataError(f"no image in {paths[0].parent} can be read: copy or export them again")
+            sizes.append(_size_of(path))
+        except DataError:
+            sizes.append(None)
+    return sizes
+
+
+def _size_of(path: Path) -> tuple[int, int] | None:
+    """Return ``(H, W)`` of an image, None if its header cannot be read.
+
+    Raises:
+        DataError: it is larger than ``MAX_SIDE``.
+    """
+    try:
+        with Image.open(path) as image:
+            _check_sides(image.size, str(path))
+            return image.size[1], image.size[0]
+    except _UNREADABLE:
+        return None
 
 
 def _check_sides(size: tuple[int, int], name: str) -> None:

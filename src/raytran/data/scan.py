@@ -34,6 +34,8 @@ SKEWED = "pose is no rigid motion"
 NO_MATRIX = "no camera-to-world matrix of numbers"
 NO_IMAGE = "no image"
 NO_POSE = "no pose"
+OTHER_SHAPE = "image of another shape than its intrinsics are for"
+TURNED = "image turned by 90° against its intrinsics"
 """Reasons why a frame is dropped; ``SCALED`` is followed by the scale."""
 
 _REMEDIES = {
@@ -60,8 +62,10 @@ class OpenScan(ABC):
         scene_id: e.g. ``scene0470_00``.
         frame_id: name of each usable frame, in the order of the numbers in it.
         world_from_camera: ``(n, 4, 4)`` float64, metres.
-        intrinsics: ``(3, 3)`` float64 for images of the stored size, pixels.
-        image_size: ``(H, W)`` as stored.
+        intrinsics: ``(n, 3, 3)`` float64 of each frame, for images of ``image_size``, pixels.
+        image_size: ``(H, W)`` as most frames are stored; the others are brought to it.
+        picture: ``(n, 4)`` float64 left, top, right and bottom of what a frame shows within an image of
+            ``image_size``, pixels; around it the image is filled up. None: every image is all picture.
         axis_alignment: ``(4, 4)`` float64, aligned_from_world; identity if the scan has none.
         dropped: reason for each frame that was left out, by frame name.
         damage: a sentence about a file that ends early, or None.
@@ -74,6 +78,7 @@ class OpenScan(ABC):
     image_size: tuple[int, int]
     axis_alignment: Tensor
     dropped: dict[str, str]
+    picture: Tensor | None = None
     damage: str | None = None
 
     def __len__(self) -> int:
@@ -88,13 +93,18 @@ class OpenScan(ABC):
         self.close()
 
     @property
+    def cameras(self) -> Cameras:
+        """The cameras of all usable frames, ``(n,)``, for images of ``image_size``."""
+        return Cameras(self.intrinsics, self.world_from_camera, self.image_size, self.picture)
+
+    @property
     @abstractmethod
     def path(self) -> Path:
         """Folder or file that it is read from."""
 
     @abstractmethod
     def color_bytes(self, index: int) -> bytes | None:
-        """Return usable frame ``index`` as stored, if that is a JPEG or PNG, else None.
+        """Return usable frame ``index`` as stored, if that is a JPEG or PNG of ``image_size``, else None.
 
         Raises:
             DataError: it cannot be read.
@@ -105,7 +115,7 @@ class OpenScan(ABC):
         """Return ``(H, W, 3)`` RGB of usable frame ``index``, resized to ``image_size`` if given.
 
         Raises:
-            DataError: the image is damaged or of another size than ``self.image_size``.
+            DataError: the image is damaged or of another size than it had when the scan was opened.
         """
 
     @abstractmethod
@@ -198,9 +208,12 @@ def scan_views(
         where=scan.path,
         min_views=min_views,
     )
-    pose = scan.world_from_camera[used]
-    cameras = Cameras(scan.intrinsics.expand(len(used), 3, 3), pose, scan.image_size).scaled_to(image_size)
-    return Views(images[None], cameras.intrinsics.float()[None], pose.float()[None]), used
+    cameras = scan.cameras[used].scaled_to(image_size).to(torch.float32)[None]
+    picture = cameras.picture
+    if picture is not None and bool((picture == picture.new_tensor([0, 0, *image_size[::-1]])).all()):
+        # None of the frames that are filled up was chosen.
+        picture = None
+    return Views(images[None], cameras.intrinsics, cameras.world_from_camera, picture), used
 
 
 def _as_tensor(image: NDArray[np.uint8]) -> Tensor:

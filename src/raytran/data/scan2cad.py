@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,8 +13,10 @@ import torch
 from torch import Tensor
 
 from raytran.data.cache import file_digest
+from raytran.data.text import as_name, read_json
 from raytran.errors import DataError
 from raytran.geometry.rotation import matrix_from_quaternion, quaternion_from_matrix
+from raytran.limits import BOX_SIDE, CAD_SCALE, HALF_EXTENT, POSITION, QUATERNION, Quantity, as_numbers, shown
 from raytran.structs import CLASS_BY_CATID, CLASSES, SYMMETRY_INFINITE, CadAlignments, ObjectSet
 
 _log = logging.getLogger(__name__)
@@ -29,6 +30,9 @@ _SYMMETRY = {
 
 SMALLEST_SCALE = 1e-3
 """Models with a smaller scale along any axis are annotation errors (ODAM skips the same)."""
+
+_LEAST_LENGTH = 1e-9
+"""Of a quaternion: what is shorter has no direction left."""
 
 _MIN_SIZE = 1e-3
 """Least size of a box, metres: a CAD model may be a flat sheet, and sizes are compared by their logarithm."""
@@ -86,7 +90,7 @@ def read_annotations(path: Path) -> dict[str, SceneAnnotation]:
         try:
             scene = parse_entry(entry)
             if scene.scene_id in scenes:
-                raise DataError(f"scene {scene.scene_id} occurs twice")
+                raise DataError(f"scene {shown(scene.scene_id)} occurs twice")
         except DataError as error:
             raise DataError(
                 f"entry {number} of {path} is not as in Scan2CAD's full_annotations.json ({error}): "
@@ -102,12 +106,7 @@ def read_entries(path: Path) -> list[Any]:
     Raises:
         DataError: the file is missing, no JSON, or no list.
     """
-    try:
-        entries = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DataError(f"cannot read the annotations {path} ({error.strerror}): check the path") from error
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{path} is not valid JSON ({error}): copy it again") from error
+    entries = read_json(Path(path))
     if not isinstance(entries, list):
         raise DataError(f"{path} is not a list of scenes as Scan2CAD's full_annotations.json: check the path")
     return entries
@@ -122,9 +121,11 @@ def parse_entry(entry: Any) -> SceneAnnotation:
     try:
         return _scene(entry)
     except KeyError as error:
-        raise DataError(f"it has no field {error}") from error
-    except (TypeError, ValueError, RuntimeError, OverflowError) as error:
-        raise DataError(f"{type(error).__name__}: {error}") from error
+        raise DataError(f"it has no field {shown(error.args[0])}") from error
+    except (TypeError, AttributeError) as error:
+        raise DataError("a list stands where an object belongs, or the other way round") from error
+    except RuntimeError as error:
+        raise DataError("the scan's trs cannot be inverted") from error
 
 
 def scene_objects(annotation: SceneAnnotation) -> ObjectSet:
@@ -186,38 +187,55 @@ def scene_alignments(annotation: SceneAnnotation) -> CadAlignments:
 
 def _scene(entry: dict[str, Any]) -> SceneAnnotation:
     models = entry["aligned_models"]
-    return SceneAnnotation(
-        scene_id=str(entry["id_scan"]),
-        model_id=tuple(f"{model['catid_cad']}/{model['id_cad']}" for model in models),
+    if not isinstance(models, list):
+        raise DataError("aligned_models is no list")
+    scene = SceneAnnotation(
+        scene_id=as_name(entry["id_scan"], "id_scan"),
+        model_id=tuple(
+            f"{as_name(model['catid_cad'], 'catid_cad')}/{as_name(model['id_cad'], 'id_cad')}"
+            for model in models
+        ),
         scan_from_cad=torch.linalg.inv(_matrices([entry["trs"]]))
         @ _matrices([model["trs"] for model in models]),
-        box_center=_vectors([model["center"] for model in models], 3),
-        box_half_size=_vectors([model["bbox"] for model in models], 3),
+        box_center=_vectors(models, "center", 3, POSITION),
+        box_half_size=_vectors(models, "bbox", 3, HALF_EXTENT),
         symmetry=torch.tensor([_symmetry(model["sym"]) for model in models], dtype=torch.int64),
-        scale=_vectors([model["trs"]["scale"] for model in models], 3),
+        scale=_vectors([model["trs"] for model in models], "scale", 3, CAD_SCALE),
     )
+    _check_boxes(scene)
+    return scene
 
 
-def _symmetry(name: str) -> int:
-    if name not in _SYMMETRY:
-        raise ValueError(f"unknown symmetry {name!r}")
+def _check_boxes(scene: SceneAnnotation) -> None:
+    """Raise if numbers that can each be true make a box together that no room has."""
+    pose = scene.scan_from_cad
+    center = (pose[:, :3, :3] @ scene.box_center[..., None])[..., 0] + pose[:, :3, 3]
+    size = 2 * scene.box_half_size * pose[:, :3, :3].norm(dim=1)
+    within = (center.abs() <= POSITION.high).all(dim=1) & (size <= BOX_SIDE.high).all(dim=1)
+    if not within.all():
+        index = int((~within).nonzero()[0])
+        raise DataError(f"the box of {shown(scene.model_id[index])} is kilometres large or away")
+
+
+def _symmetry(name: Any) -> int:
+    if not isinstance(name, str) or name not in _SYMMETRY:
+        raise DataError(f"unknown symmetry {shown(name)}")
     return _SYMMETRY[name]
 
 
-def _matrices(trs: Sequence[dict[str, Sequence[float]]]) -> Tensor:
+def _matrices(trs: Sequence[dict[str, Any]]) -> Tensor:
     """Return T · R · S of each entry, ``(M, 4, 4)`` float64; quaternions are [w, x, y, z]."""
     matrices = torch.eye(4, dtype=torch.float64).repeat(len(trs), 1, 1)
-    quaternion = _vectors([entry["rotation"] for entry in trs], 4)
-    if (quaternion == 0).all(dim=1).any():
-        raise ValueError("a quaternion has length zero")
+    quaternion = _vectors(trs, "rotation", 4, QUATERNION)
+    if (quaternion.norm(dim=1) < _LEAST_LENGTH).any():
+        raise DataError("a quaternion has length zero")
     rotation = matrix_from_quaternion(quaternion)
-    matrices[:, :3, :3] = rotation * _vectors([entry["scale"] for entry in trs], 3)[:, None]
-    matrices[:, :3, 3] = _vectors([entry["translation"] for entry in trs], 3)
+    matrices[:, :3, :3] = rotation * _vectors(trs, "scale", 3, CAD_SCALE)[:, None]
+    matrices[:, :3, 3] = _vectors(trs, "translation", 3, POSITION)
     return matrices
 
 
-def _vectors(rows: Sequence[Sequence[float]], length: int) -> Tensor:
-    vectors = torch.tensor(rows, dtype=torch.float64).reshape(len(rows), length)
-    if not vectors.isfinite().all():
-        raise ValueError("a number is not finite")
-    return vectors
+def _vectors(entries: Sequence[dict[str, Any]], key: str, length: int, quantity: Quantity) -> Tensor:
+    """Return the numbers that each entry has under a key, ``(M, length)`` float64."""
+    rows = [entry[key] for entry in entries]
+    return torch.from_numpy(as_numbers(rows, (len(rows), length), quantity, key))

@@ -12,6 +12,7 @@ import torch
 
 from raytran.data.scan2cad import SceneAnnotation
 from raytran.data.scannet.scan import Scan, read_scan
+from raytran.data.text import read_names
 from raytran.errors import DataError
 from raytran.structs import ObjectSet
 
@@ -57,11 +58,11 @@ def read_split(scannet: Path, split: str) -> list[str] | None:
     """Return the scans of ``scannetv2_<split>.txt``, or None if there are no split files at all.
 
     Raises:
-        DataError: there are others, but not this one.
+        DataError: there are others, but not this one; or it cannot be read.
     """
     path = scannet / f"scannetv2_{split}.txt"
     if path.is_file():
-        return path.read_text(encoding="utf-8").split()
+        return read_names(path)
     if any(scannet.glob("scannetv2_*.txt")):
         raise DataError(f"there is no {path}: choose a split that has a file, or write its scans there")
     return None

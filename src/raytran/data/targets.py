@@ -20,6 +20,7 @@ from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.rasterize import rasterize_ids, rasterize_mask, rasterize_visible
+from raytran.limits import POSITION
 from raytran.structs import SHAPE_SIZE, ObjectSet
 
 _MAX_POINTS = 1 << 25
@@ -205,15 +206,12 @@ def _cached_per_camera(
     draw: Callable[[Cameras], NDArray[np.bool_]],
 ) -> Tensor:
     """Return an array for each of N cameras, ``(N, *shape)``; ``draw`` makes those that the cache lacks."""
-    intrinsics, world_from_camera = cameras.intrinsics.numpy(), cameras.world_from_camera.numpy()
-    keys = [
-        digest(scene_key, cameras.image_size, *camera)
-        for camera in zip(intrinsics, world_from_camera, strict=True)
-    ]
+    facts = [cameras.intrinsics.numpy(), cameras.world_from_camera.numpy()]
+    facts += [] if cameras.picture is None else [cameras.picture.numpy()]
+    keys = [digest(scene_key, cameras.image_size, *camera) for camera in zip(*facts, strict=True)]
     arrays, missing = cache.read_stack(kind, keys, shape)
     if missing:
-        chosen = Cameras(cameras.intrinsics[missing], cameras.world_from_camera[missing], cameras.image_size)
-        arrays[missing] = draw(chosen)
+        arrays[missing] = draw(cameras[missing])
         for i in missing:
             cache.write(kind, keys[i], arrays[i])
     return torch.from_numpy(arrays)
@@ -227,12 +225,16 @@ def _scan_surface(path: Path, _content: str) -> tuple[NDArray, NDArray]:
         DataError: it cannot be read.
     """
     try:
-        mesh = trimesh.load(path, process=False)
+        with np.errstate(all="ignore"):  # what numbers there are is looked at below
+            mesh = trimesh.load(path, process=False)
     except Exception as error:  # a damaged file can fail anywhere in trimesh
-        raise DataError(f"cannot read the mesh {path} ({error}): copy it again") from error
+        raise DataError(f"cannot read the mesh {path} ({str(error)[:80]!r}): copy it again") from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise DataError(f"{path} holds no triangles: copy the scan's mesh again")
-    return np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
+    if not (np.abs(vertices) <= POSITION.high).all() or faces.min() < 0 or faces.max() >= len(vertices):
+        raise DataError(f"{path} has triangles of points that are nowhere: copy the scan's mesh again")
+    return vertices, faces
 
 
 def cad_meshes(objects: ObjectSet, *, shapenet_root: Path) -> list[tuple[NDArray, NDArray]]:

@@ -8,7 +8,11 @@ commas for blanks. What no program writes ends in one sentence, and takes neithe
 from __future__ import annotations
 
 import codecs
+import io
 import json
+import re
+from array import array
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +20,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from raytran.errors import DataError
+from raytran.limits import shown
 
 MAX_BYTES = 64 * 2**20
 """Bytes of a text file that are read: lists of a hundred thousand frames are smaller."""
+
+_MAX_VALUES = 8_000_000
+"""Numbers, texts and lists in a JSON file, objects counted thrice: two bytes of text can cost a hundred of
+memory. Cameras of a hundred thousand frames have two million."""
+
+_MAX_NAME = 200
+"""Characters of a name."""
 
 _WIDE_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
@@ -57,15 +69,19 @@ def read_table(path: Path, *, max_bytes: int = MAX_BYTES) -> NDArray[np.float64]
         DataError: the file cannot be read, see ``read_text``, or its lines hold no numbers or not as many
             each.
     """
-    lines = read_text(path, max_bytes=max_bytes).splitlines()
-    rows = [parted(line) for line in lines]
-    try:
-        return np.array([[float(word) for word in row] for row in rows if row], dtype=np.float64)
-    except ValueError as error:
-        number = next(i for i, row in enumerate(rows, 1) if row and not _is_like(row, rows))
-        raise DataError(
-            f"line {number} of {path} does not hold numbers, as many as the other lines do: mend it"
-        ) from error
+    # Rows of Python's numbers would take forty bytes for each byte of text.
+    numbers = array("d")
+    width = 0
+    for number, line in enumerate(io.StringIO(read_text(path, max_bytes=max_bytes), newline=None), start=1):
+        words = parted(line)
+        try:
+            numbers.extend(map(float, words))
+        except ValueError as error:
+            raise _no_row(path, number) from error
+        if words and len(words) != (width := width or len(words)):
+            raise _no_row(path, number)
+    table = np.array(numbers, dtype=np.float64)
+    return table.reshape(-1, width) if width else table
 
 
 def parted(line: str) -> list[str]:
@@ -76,32 +92,78 @@ def parted(line: str) -> list[str]:
 _PARTED = str.maketrans(",;", "  ")
 
 
-def _is_like(row: list[str], rows: list[list[str]]) -> bool:
-    """Whether a row holds numbers, as many as the first."""
-    try:
-        return len([float(word) for word in row]) == len(next(other for other in rows if other))
-    except ValueError:
-        return False
+def _no_row(path: Path, number: int) -> DataError:
+    return DataError(f"line {number} of {path} does not hold numbers, as many as the other lines do: mend it")
+
+
+def read_names(path: Path) -> list[str]:
+    """Return the words of a text file, e.g. the scans of a split.
+
+    Raises:
+        DataError: the file cannot be read, see ``read_text``, or a word is no name.
+    """
+    return [as_name(word, f"a word in {path}") for word in read_text(path).split()]
+
+
+def as_name(value: object, what: str) -> str:
+    """Return a text that can name something: a scan, a model, a preset.
+
+    Args:
+        value: what a file holds, of any type.
+        what: name of the value and its place.
+
+    Raises:
+        DataError: it is another type, empty, longer than 200 characters, or more than one line.
+    """
+    if not isinstance(value, str) or not 0 < len(value) <= _MAX_NAME or not value.isprintable():
+        raise DataError(f"{what} is {shown(value)}, no name of at most {_MAX_NAME} characters: mend it")
+    return value
 
 
 def read_json(path: Path, *, max_bytes: int = MAX_BYTES) -> Any:
     """Return what a JSON file holds; whole numbers of more than 18 digits are floats, infinite if need be.
 
     Raises:
-        DataError: the file cannot be read, see ``read_text``; it is no JSON, is nested too deeply, or holds
-            text that no file name or message can hold.
+        DataError: the file cannot be read, see ``read_text``; it is no JSON, is nested too deeply, has a key
+            twice in one object, millions of values, or text that no file name or message can hold.
     """
-    text = read_text(path, max_bytes=max_bytes)
+    return parse_json(read_text(path, max_bytes=max_bytes), str(path))
+
+
+def parse_json(text: str, what: str) -> Any:
+    """Return what a text in JSON stands for, as ``read_json`` does for a file.
+
+    Args:
+        text: of at most ``MAX_BYTES``.
+        what: what to call it in messages.
+
+    Raises:
+        DataError: see ``read_json``.
+    """
+    if text.count(",") + text.count("[") + 3 * text.count("{") > _MAX_VALUES:
+        raise DataError(f"{what} holds more than {_MAX_VALUES:,} values: check that it is the right file")
     try:
-        content = json.loads(text, parse_int=_as_whole)
+        content = json.loads(text, parse_int=_as_whole, object_pairs_hook=_as_object)
     except (ValueError, RecursionError) as error:
-        raise DataError(f"{path} is no valid JSON ({str(error)[:80]}): export it again") from error
+        raise DataError(f"{what} is no valid JSON ({str(error)[:80]}): export it again") from error
     # Halves of a UTF-16 pair are valid JSON, but no text.
-    if "\\ud" in text or "\\uD" in text:
+    if _HALF.search(text):
         try:
             json.dumps(content, ensure_ascii=False).encode()
         except (UnicodeEncodeError, ValueError, RecursionError) as error:
-            raise DataError(f"{path} holds text that is no Unicode: export it again") from error
+            raise DataError(f"{what} holds text that is no Unicode: export it again") from error
+    return content
+
+
+_HALF = re.compile(r"\\u[dD][89a-fA-F]")
+
+
+def _as_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return an object; one of two values of a key would be taken at random."""
+    content = dict(pairs)
+    if len(content) != len(pairs):
+        (twice, _), *_ = Counter(key for key, _ in pairs).most_common(1)
+        raise ValueError(f"the key {shown(twice)} comes twice")
     return content
 
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import logging
 import math
 import re
@@ -16,11 +15,23 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from raytran.data.text import read_text
+from raytran.data.text import as_name, read_json_object, read_text
 from raytran.errors import DataError
 from raytran.export.cad_alignments import ALIGNMENTS, SCAN2CAD_COLUMNS, align_cads
 from raytran.export.write import FORMAT
 from raytran.geometry.rotation import matrix_from_quaternion
+from raytran.limits import (
+    BOX_SIDE,
+    MATRIX_ENTRY,
+    POSITION,
+    QUATERNION,
+    SCALE,
+    SCORE,
+    Quantity,
+    as_number,
+    as_numbers,
+    shown,
+)
 from raytran.structs import CLASS_BY_CATID, CLASSES, CadAlignments, ObjectSet, ScenePrediction
 
 _log = logging.getLogger(__name__)
@@ -59,6 +70,20 @@ _THINNEST = 1e-3
 
 _NOT_ORTHOGONAL = 1e-3
 """Largest entry of ``RᵀR - 1`` of a matrix that still counts as a rotation."""
+
+_LEAST_LENGTH = 1e-9
+"""Of a quaternion: what is shorter has no direction left."""
+
+_MAX_CSV = 16 * 2**20
+"""Bytes of a CSV that are read: all rows of Scan2CAD's benchmark have three megabytes."""
+
+_QUANTITIES: dict[str, Quantity] = {
+    **dict.fromkeys(("tx", "ty", "tz"), POSITION),
+    **dict.fromkeys(("qw", "qx", "qy", "qz"), QUATERNION),
+    # Of either sign here: what a scale that is not positive means is said in words of its own.
+    **dict.fromkeys(("sx", "sy", "sz"), Quantity(SCALE.name, -SCALE.high, SCALE.high)),
+}
+"""What the columns of numbers measure, but for the score."""
 
 CadBoxes = Mapping[str, tuple[Tensor, Tensor]]
 """Centre and half extents ``(3,)`` of each annotated CAD model's box in CAD units, by ``catid/id``."""
@@ -187,20 +212,19 @@ def _read_scene(path: Path, scene_id: str, cad_boxes: CadBoxes) -> ScenePredicti
         raise DataError(
             f"{path} says that it is scene {prediction.scene_id!r}, but its name says {scene_id!r}: rename it"
         )
-    _check_objects(prediction.objects, path)
     return _from_objects(path, prediction.objects, cad_boxes)
 
 
 def _check_objects(objects: ObjectSet, path: Path) -> None:
     """Raise on an object that nothing can be compared with, naming its line."""
     identity = torch.eye(3, dtype=torch.float64)
-    skew = (objects.rotation.mT @ objects.rotation - identity).abs().amax(dim=(-2, -1))
+    rotation = objects.rotation.nan_to_num()
+    skew = (rotation.mT @ rotation - identity).abs().amax(dim=(-2, -1))
     numbers = [objects.center, objects.size, objects.rotation.flatten(1), objects.score[:, None]]
     faults = {
-        "a number is not finite": ~torch.cat(numbers, dim=1).isfinite().all(dim=1),
+        "a number is not finite, or kilometres": ~torch.cat(numbers, dim=1).isfinite().all(dim=1),
         "a size is not positive": (objects.size <= 0).any(dim=1),
-        "the rotation is no rotation matrix": (skew > _NOT_ORTHOGONAL)
-        | (torch.linalg.det(objects.rotation.nan_to_num()) <= 0),
+        "the rotation is no rotation matrix": (skew > _NOT_ORTHOGONAL) | (torch.linalg.det(rotation) <= 0),
     }
     for fault, where in faults.items():
         if where.any():
@@ -210,9 +234,9 @@ def _check_objects(objects: ObjectSet, path: Path) -> None:
 
 def _line_of_object(path: Path, index: int) -> int:
     """Return the line on which an object's ``category`` stands: JSON parsers do not keep lines."""
-    text = path.read_text(encoding="utf-8")
+    text = read_text(path)
     starts = [match.start() for match in re.finditer(r'"category"\s*:', text)]
-    return text.count("\n", 0, starts[index]) + 1
+    return text.count("\n", 0, starts[index]) + 1 if index < len(starts) else 1
 
 
 def _from_alignments(path: Path, cads: CadAlignments, cad_boxes: CadBoxes) -> ScenePredictions:
@@ -224,13 +248,24 @@ def _from_alignments(path: Path, cads: CadAlignments, cad_boxes: CadBoxes) -> Sc
     objects = ObjectSet(
         label=torch.tensor([CLASSES.index(name) for name in known.category], dtype=torch.int64),
         center=known.translation + (rotation @ (known.scale * center)[..., None])[..., 0],
-        size=(2 * half * known.scale).clamp(min=_THINNEST),
+        size=_sizes(2 * half * known.scale, path),
         rotation=rotation,
         symmetry=torch.ones(len(known), dtype=torch.int64),
         score=known.score,
         model_id=known.model_id,
     )
     return ScenePredictions(path, objects, cads, cads, n_unknown_cads=len(cads) - len(known))
+
+
+def _sizes(sizes: Tensor, path: Path) -> Tensor:
+    """Return the sizes of boxes, none thinner than annotated ones.
+
+    Raises:
+        DataError: a CAD model and its scale, each possible, make a box of kilometres.
+    """
+    if not (sizes <= BOX_SIDE.high).all():
+        raise DataError(f"{path} has a box of {float(sizes.max()):g} m: write sizes in metres a CAD unit")
+    return sizes.clamp(min=_THINNEST)
 
 
 def _from_objects(path: Path, objects: ObjectSet, cad_boxes: CadBoxes) -> ScenePredictions:
@@ -272,43 +307,64 @@ def read_scene_json(path: Path) -> ScenePrediction:
     Raises:
         DataError: the file is missing, damaged, of another format, or names an unknown category.
     """
-    try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise DataError(f"no scene file at {path}; write one with `python -m raytran.predict`") from error
-    except (OSError, ValueError, RecursionError) as error:
-        raise DataError(f"cannot read {path} as JSON ({error}); write it again") from error
-    named = content.get("format") if isinstance(content, dict) else None
+    path = Path(path)
+    if not path.exists():
+        raise DataError(f"no scene file at {path}; write one with `python -m raytran.predict`")
+    content = read_json_object(path)
+    named = content.get("format")
     if named != FORMAT:
-        raise DataError(f"{path} has format {named!r}, this version reads {FORMAT!r}; write it again")
-    try:
-        return ScenePrediction(
-            scene_id=str(content["scene_id"]),
-            objects=_objects_from_json(content["objects"]),
-            grid_center=torch.full((3,), torch.nan),
-        )
-    except (KeyError, TypeError, ValueError, RuntimeError, AttributeError, OverflowError) as error:
-        raise DataError(
-            f"an object in {path} is incomplete or malformed ({error!r}); write it again"
-        ) from error
+        raise DataError(f"{path} has format {shown(named)}, this version reads {FORMAT!r}; write it again")
+    entries = content.get("objects")
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise DataError(f"{path} has no list of objects: write it again")
+    # One may write an empty name.
+    scene_id = content.get("scene_id") and as_name(content["scene_id"], f"scene_id in {path}")
+    if not isinstance(scene_id, str):
+        raise DataError(f"{path} has no scene_id: write it again")
+    prediction = ScenePrediction(
+        scene_id=scene_id,
+        objects=_objects_from_json(entries, path),
+        grid_center=torch.full((3,), torch.nan),
+    )
+    _check_objects(prediction.objects, path)
+    return prediction
 
 
-def _objects_from_json(entries: Sequence[dict[str, Any]]) -> ObjectSet:
+def _objects_from_json(entries: Sequence[dict[str, Any]], path: Path) -> ObjectSet:
     count = len(entries)
 
-    def column(key: str, *shape: int) -> torch.Tensor:
-        return torch.tensor([entry[key] for entry in entries], dtype=torch.float64).reshape(count, *shape)
+    def column(key: str, quantity: Quantity, *shape: int) -> torch.Tensor:
+        rows = [entry.get(key) for entry in entries]
+        # What is out of bounds becomes NaN, of which `_check_objects` names the line.
+        values = as_numbers(rows, (count, *shape), quantity, f"{key} of the objects in {path}", lost=True)
+        return torch.from_numpy(values)
 
-    models = tuple("/".join((e["catid_cad"], e["id_cad"])) if e.get("id_cad") else "" for e in entries)
+    models = tuple(_model_id(entry, path) for entry in entries)
     return ObjectSet(
-        label=torch.tensor([CLASSES.index(entry["category"]) for entry in entries], dtype=torch.int64),
-        center=column("center", 3),
-        size=column("size", 3),
-        rotation=column("rotation", 3, 3),
+        label=torch.tensor([_label(entry, path) for entry in entries], dtype=torch.int64),
+        center=column("center", POSITION, 3),
+        size=column("size", Quantity("a length in metres", -BOX_SIDE.high, BOX_SIDE.high), 3),
+        rotation=column("rotation", MATRIX_ENTRY, 3, 3),
         symmetry=torch.ones(count, dtype=torch.int64),
-        score=column("score"),
+        score=column("score", SCORE),
         model_id=models if any(models) else (),
     )
+
+
+def _label(entry: Mapping[str, Any], path: Path) -> int:
+    category = entry.get("category")
+    if category not in CLASSES:
+        raise DataError(
+            f"{path} has an object of category {shown(category)}: choose one of {', '.join(CLASSES)}"
+        )
+    return CLASSES.index(category)
+
+
+def _model_id(entry: Mapping[str, Any], path: Path) -> str:
+    """Return ``catid/id`` of the CAD model of an object, empty if it has none."""
+    if not entry.get("id_cad"):
+        return ""
+    return "/".join(as_name(entry.get(key), f"{key} in {path}") for key in ("catid_cad", "id_cad"))
 
 
 class _Row(NamedTuple):
@@ -369,8 +425,9 @@ def _read_rows(path: Path, forms: Sequence[tuple[str, ...]]) -> list[_Row]:
     rows: list[_Row] = []
     not_unit: list[int] = []
     columns: tuple[str, ...] | None = None
+    is_first = True
     try:
-        lines = read_text(path).splitlines()
+        lines = read_text(path, max_bytes=_MAX_CSV).splitlines()
         separator = ";" if lines and "," not in lines[0] else ","  # spreadsheets write semicolons
         table = list(csv.reader(lines, delimiter=separator))
     except csv.Error as error:
@@ -379,7 +436,8 @@ def _read_rows(path: Path, forms: Sequence[tuple[str, ...]]) -> list[_Row]:
         cells = [cell.strip() for cell in cells]
         if not any(cells):
             continue
-        if not rows and len(cells) in map(len, forms) and _is_header(cells[3:]):
+        is_first, may_be_header = False, is_first
+        if may_be_header and len(cells) in map(len, forms) and _is_header(cells[3:]):
             _log.warning("%s, line %d: skipped a header row", path, line)
             continue
         columns = columns or _form_of(cells, forms)
@@ -450,15 +508,18 @@ def _numbers(cells: list[str], columns: tuple[str, ...], path: Path, line: int) 
     for name, cell in zip(columns, cells, strict=True):
         if not _parses(float, cell) or not math.isfinite(float(cell)):
             raise DataError(f"{path}, line {line}: {name} is {cell[:50]!r}, write a finite number")
-    return [float(cell) for cell in cells]
+    return [
+        as_number(float(cell), _QUANTITIES.get(name, SCORE), f"{name} in line {line} of {path}")
+        for name, cell in zip(columns, cells, strict=True)
+    ]
 
 
 def _checked_length(row: _Row, path: Path) -> float:
     """Return the length of a row's quaternion; a pose that no object can have is an error."""
     length = math.hypot(*row.values[3:7])
-    if length == 0:
+    if length < _LEAST_LENGTH:
         raise DataError(f"{path}, line {row.line}: the quaternion has length zero, write a rotation")
-    if min(row.values[7:10]) <= 0:
+    if min(row.values[7:10]) < SCALE.low:
         raise DataError(f"{path}, line {row.line}: a scale is not positive, write sizes in metres a CAD unit")
     return length
 

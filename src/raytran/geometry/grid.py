@@ -13,8 +13,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from raytran.errors import check_shape
+from raytran.errors import ConfigError, check_shape
 from raytran.geometry.camera import Cameras
+from raytran.setting_limits import MAX_CELLS, check_settings
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,10 @@ class VoxelGrid:
         resolution: ``(X, Y, Z)``.
         extent: sizes of the whole grid along x, y, z, metres.
         center: ``(..., 3)`` centre of the grid in the world, metres; leading dimensions are scenes.
+
+    Raises:
+        ConfigError: a number of voxels or a size is not positive, not finite, or beyond all use.
+        ShapeError: the centre has another shape.
     """
 
     resolution: tuple[int, int, int]
@@ -34,8 +39,9 @@ class VoxelGrid:
     def __post_init__(self) -> None:
         center = torch.as_tensor(self.center)
         object.__setattr__(self, "center", center if center.is_floating_point() else center.float())
-        object.__setattr__(self, "resolution", tuple(int(n) for n in self.resolution))
-        object.__setattr__(self, "extent", tuple(float(length) for length in self.extent))
+        resolution, extent = checked_grid(self.resolution, self.extent)
+        object.__setattr__(self, "resolution", resolution)
+        object.__setattr__(self, "extent", extent)
         if self.center.shape[-1:] != (3,):
             check_shape(self.center, "... 3", "center")
 
@@ -78,6 +84,26 @@ class VoxelGrid:
     def _vector(self, values: tuple[float, ...]) -> Tensor:
         # Not torch.tensor: a copy to a GPU would make the host wait for it.
         return torch.stack([self.center.new_full((), value) for value in values])
+
+
+def checked_grid(
+    resolution: Sequence[int], extent: Sequence[float]
+) -> tuple[tuple[int, int, int], tuple[float, float, float]]:
+    """Return numbers of voxels and sizes of a grid, metres, that a grid can have.
+
+    Raises:
+        ConfigError: they are not three each, not positive, not finite, or beyond all use.
+    """
+    if len(resolution) != 3 or len(extent) != 3:
+        raise ConfigError(
+            f"a voxel grid has {len(resolution)} numbers of voxels and {len(extent)} sizes: give three each"
+        )
+    check_settings({"grid_resolution": list(resolution), "grid_extent": list(extent)})
+    x, y, z = (int(n) for n in resolution)
+    if x * y * z > MAX_CELLS:
+        raise ConfigError(f"a voxel grid of {x} x {y} x {z} has more than {MAX_CELLS:,} voxels: give fewer")
+    a, b, c = (float(length) for length in extent)
+    return (x, y, z), (a, b, c)
 
 
 LOWEST, HIGHEST = 0.5, 16.0

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from raytran.data.files import SettingsRecord
+from raytran.data.text import read_names
 from raytran.rooms.benchmark import generate_rooms_v1
 from raytran.rooms.generate import generate_rooms
 
@@ -90,4 +91,4 @@ def rooms_are_complete(output: Path, lists: Sequence[str] = LISTS) -> bool:
 
 
 def _scans(output: Path, name: str) -> list[str]:
-    return (output / "scannet" / name).read_text(encoding="utf-8").split()
+    return read_names(output / "scannet" / name)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import asdict, dataclass
@@ -17,8 +16,10 @@ import numpy as np
 from raytran.data.files import write_json
 from raytran.data.shapenet.meshes import read_face_colors
 from raytran.data.shapenet.models import mesh_path, model_names, read_mesh
+from raytran.data.text import read_json_object
 from raytran.data.workers import work_on
 from raytran.errors import DataError
+from raytran.limits import BOX_SIDE, COORDINATE, as_numbers
 from raytran.rooms.cad import OTHER_IDS, CadModel, sample_model
 from raytran.rooms.kinds import KINDS, KNOWN_CATIDS, draw_size, guess_kind
 from raytran.rooms.symmetry import measure_symmetry
@@ -157,16 +158,20 @@ def read_library(path: Path, root: Path) -> CadLibrary:
     Raises:
         DataError: the file is missing or damaged.
     """
+    values = read_json_object(path)
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
         models = tuple(
-            LibraryModel(**(model | {"size_m": tuple(model["size_m"])})) for model in values["models"]
+            LibraryModel(
+                **model
+                | {"size_m": tuple(as_numbers(model["size_m"], (3,), BOX_SIDE, f"size_m in {path}").tolist())}
+            )
+            for model in values["models"]
         )
         return CadLibrary(root, models, values["left_out"], values["digest"])
-    except OSError as error:
-        raise DataError(f"cannot read {path}: {error.strerror}; give the same command again") from error
-    except (ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{path} is damaged ({error}); remove it and give the same command again") from error
+    except (KeyError, TypeError) as error:
+        raise DataError(
+            f"{path} is damaged ({str(error)[:80]}); remove it and give the same command again"
+        ) from error
 
 
 def _chosen(names: list[tuple[str, str]]) -> list[tuple[str, str]]:
@@ -221,10 +226,9 @@ def _model(root: Path, catid: str, model_id: str) -> LibraryModel:
 def _facts(path: Path) -> dict[str, Any]:
     """Return a model's ``.json``, empty if it has none that can be read."""
     try:
-        facts = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        return read_json_object(path.with_suffix(".json"))
+    except DataError:
         return {}
-    return facts if isinstance(facts, dict) else {}
 
 
 def _size_of(facts: dict[str, Any]) -> np.ndarray | None:
@@ -232,10 +236,10 @@ def _size_of(facts: dict[str, Any]) -> np.ndarray | None:
     if facts.get("unit") != "m":
         return None
     try:
-        size = np.subtract(facts["max"], facts["min"]).astype(np.float64)
-    except (KeyError, TypeError, ValueError):
+        high, low = (as_numbers(facts.get(key), (3,), COORDINATE, key) for key in ("max", "min"))
+        return as_numbers((high - low).tolist(), (3,), BOX_SIDE, "max - min")
+    except DataError:
         return None
-    return size if size.shape == (3,) and np.isfinite(size).all() and (size > 0).all() else None
 
 
 @lru_cache(maxsize=128)

@@ -5,13 +5,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any, Literal
 
 from torch import nn
 from torch.optim import AdamW
 from torch.optim.lr_scheduler import LambdaLR
+
+from raytran.setting_limits import check_settings
 
 
 def learning_rate_factor(step: int, *, total_steps: int, warmup_steps: int, decay: str) -> float:
@@ -37,12 +39,18 @@ class Optimization:
         weight_decay: decoupled weight decay, on all parameters.
         warmup_steps: optimiser steps of linear rise.
         decay: ``none`` or ``cosine``.
+
+    Raises:
+        ConfigError: a number is none that an optimiser can have.
     """
 
     learning_rate: float = 1e-4
     weight_decay: float = 5e-2
     warmup_steps: int = 0
     decay: Literal["none", "cosine"] = "none"
+
+    def __post_init__(self) -> None:
+        check_settings(asdict(self))
 
     def build(self, parameters: Iterable[nn.Parameter], total_steps: int) -> dict[str, Any]:
         """Return optimiser and schedule for the parameters that train, as Lightning expects them."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,13 +22,30 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from raytran.errors import DataError
+from raytran.data.scannet.text import are_rigid
+from raytran.data.text import as_name, parse_json
+from raytran.errors import DataError, RaytranError
 from raytran.export import read_scene_json
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
+from raytran.limits import (
+    BOX_SIDE,
+    FOCAL_LENGTH,
+    MATRIX_ENTRY,
+    MAX_SIDE,
+    PIXEL,
+    POSITION,
+    SCORE,
+    SIDE,
+    Quantity,
+    as_count,
+    as_numbers,
+    shown,
+)
 from raytran.ops.traverse import trace_pairs
 from raytran.pictures.overlay import frame_image
-from raytran.structs import ObjectSet, ScenePrediction, Views
+from raytran.structs import CLASSES, ObjectSet, ScenePrediction, Views
+from raytran.viewer.archive import read_arrays
 from raytran.viewer.attention import ReadPixels, VoxelReads, attention_weights, pack_reads
 from raytran.viewer.truth import ObjectError, object_errors
 
@@ -51,6 +67,8 @@ _DEPTH = 3
 
 _TRUTH = ("label", "center", "size", "rotation", "symmetry", "score")
 """What is stored of the true objects, in the order of ``ObjectSet``."""
+
+_INTRINSIC = Quantity("a focal length or a pixel", PIXEL.low, FOCAL_LENGTH.high)
 
 _LONGEST_SIDE = 480
 _QUALITY = 80
@@ -116,8 +134,7 @@ class ViewerScene:
 
     def camera(self, frame: int) -> Cameras:
         """Return the camera of one frame, no leading dimensions."""
-        cameras = self.cameras
-        return Cameras(cameras.intrinsics[frame], cameras.world_from_camera[frame], cameras.image_size)
+        return self.cameras[frame]
 
     @property
     def occupancy(self) -> Tensor | None:
@@ -180,10 +197,8 @@ def _read_volumes(
     features = observed.runs([len(frames) * size[0] * size[1] for _, frames in runs])
     volumes = []
     for (center, frames), (query, key) in zip(runs, features, strict=True):
-        index = list(frames)
-        pose = views.world_from_camera[0, index].cpu()
-        cameras = Cameras(views.intrinsics[0, index].cpu(), pose, views.image_size)
-        grid = VoxelGrid(model.grid_resolution, model.grid_extent, center.to(pose))
+        cameras = Cameras.of(views.scene())[list(frames)].to("cpu")
+        grid = VoxelGrid(model.grid_resolution, model.grid_extent, center.to(cameras.position))
         pairs = trace_pairs(cameras, grid, size, model.rays_per_cell)
         reads = pack_reads(attention_weights(query, key, pairs), pairs, size)
         volumes.append(VoxelVolume(grid, frames, reads=reads))
@@ -222,6 +237,8 @@ def write_viewer_data(
         "intrinsics": views.intrinsics[0].double().cpu().numpy(),
         "world_from_camera": views.world_from_camera[0].double().cpu().numpy(),
     }
+    if views.picture is not None:
+        arrays["picture"] = views.picture[0].double().cpu().numpy()
     for n in range(len(frame_ids)):
         arrays[f"frame{n}"] = _jpeg(frame_image(views, n))
     for n, volume in enumerate(volumes):
@@ -281,69 +298,122 @@ def read_viewer_scene(folder: Path) -> ViewerScene:
     path = folder / FILE
     try:
         if path.exists():
-            with np.load(path, allow_pickle=False) as file:
-                arrays = dict(file)
-            about = json.loads(arrays["about"].tobytes())
+            arrays = read_arrays(path)
+            about = parse_json(arrays["about"].tobytes().decode(), "its description")
             if about["format"] != FORMAT:
-                raise ValueError(f"format {about['format']!r}, this version reads {FORMAT!r}")
+                raise ValueError(f"format {shown(about['format'])}, this version reads {FORMAT!r}")
         truth = _truth(arrays) if about["has_truth"] else None
-        height, width = about["image_size"]
-        pose = torch.from_numpy(arrays["world_from_camera"])
+        names = [as_name(name, "a frame's name") for name in about["frame_ids"]]
         return ViewerScene(
             scene_id=result.scene_id,
             objects=objects,
             meshes=meshes,
-            frame_ids=[str(name) for name in about["frame_ids"]],
-            images=[_image(arrays[f"frame{n}"]) for n in range(len(about["frame_ids"]))],
-            cameras=Cameras(torch.from_numpy(arrays["intrinsics"]), pose, (height, width)),
-            volumes=[_volume(entry, n, arrays) for n, entry in enumerate(about["volumes"])],
+            frame_ids=names,
+            images=[_image(arrays[f"frame{n}"]) for n in range(len(names))],
+            cameras=_cameras(arrays, about["image_size"], len(names)),
+            volumes=[_volume(entry, n, arrays, len(names)) for n, entry in enumerate(about["volumes"])],
             truth=truth,
             errors=[None] * len(objects) if truth is None else object_errors(objects, truth),
         )
-    except (OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile) as error:
-        raise DataError(f"cannot read {path} ({error}): predict again") from error
+    except (OSError, ValueError, KeyError, TypeError, RuntimeError, RaytranError) as error:
+        raise DataError(f"cannot read {path} ({str(error)[:120]}): predict again") from error
+
+
+def _cameras(arrays: Mapping[str, NDArray[Any]], image_size: Any, count: int) -> Cameras:
+    height, width = as_numbers(image_size, (2,), SIDE, "image_size").astype(int).tolist()
+    intrinsics = as_numbers(
+        arrays["intrinsics"],
+        (count, 3, 3),
+        _INTRINSIC,
+        "intrinsics",
+    )
+    poses = as_numbers(arrays["world_from_camera"], (count, 4, 4), MATRIX_ENTRY, "world_from_camera")
+    if (intrinsics[:, [0, 1], [0, 1]] < FOCAL_LENGTH.low).any() or not are_rigid(poses).all():
+        raise ValueError("a camera is none that can be")
+    picture = None
+    if "picture" in arrays:
+        picture = torch.from_numpy(as_numbers(arrays["picture"], (count, 4), PIXEL, "picture"))
+    return Cameras(torch.from_numpy(intrinsics), torch.from_numpy(poses), (height, width), picture)
 
 
 def _read_mesh(path: Path) -> trimesh.Trimesh | None:
     if not path.is_file():
         return None
     try:
-        mesh = trimesh.load_mesh(path, process=False)
+        with np.errstate(all="ignore"):  # what numbers there are is looked at below
+            mesh = trimesh.load_mesh(path, process=False)
     except Exception as error:  # trimesh raises whatever its parser stumbles over
-        raise DataError(f"cannot read the mesh {path} ({error}): predict again") from error
+        raise DataError(f"cannot read the mesh {path} ({str(error)[:80]!r}): predict again") from error
+    if not isinstance(mesh, trimesh.Trimesh) or not (np.abs(mesh.vertices) <= POSITION.high).all():
+        raise DataError(f"the mesh {path} has vertices that are nowhere, or none at all: predict again")
     return mesh
 
 
 def _image(content: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    with Image.open(io.BytesIO(content.tobytes())) as image:
+    # No other decoder than that of what is written.
+    with Image.open(io.BytesIO(content.tobytes()), formats=["JPEG"]) as image:
+        if max(image.size) > MAX_SIDE:
+            raise ValueError(f"a frame has {image.width} x {image.height} pixels")
         return np.asarray(image.convert("RGB"))
 
 
 def _truth(arrays: Mapping[str, NDArray[Any]]) -> ObjectSet:
-    label, center, size, rotation, symmetry, score = (
-        torch.from_numpy(arrays[f"truth_{name}"]) for name in _TRUTH
+    label, center, size, rotation, symmetry, score = (arrays[f"truth_{name}"] for name in _TRUTH)
+    count = len(label)
+    as_numbers(label, (count,), Quantity("a class", 0, len(CLASSES) - 1), "label")
+    as_numbers(symmetry, (count,), Quantity("a symmetry", 0, 64), "symmetry")
+    as_numbers(center, (count, 3), POSITION, "center")
+    as_numbers(size, (count, 3), BOX_SIDE, "size")
+    as_numbers(rotation, (count, 3, 3), MATRIX_ENTRY, "rotation")
+    as_numbers(score, (count,), SCORE, "score")
+    return ObjectSet(
+        label=torch.from_numpy(label.astype(np.int64)),
+        center=torch.from_numpy(center),
+        size=torch.from_numpy(size),
+        rotation=torch.from_numpy(rotation),
+        symmetry=torch.from_numpy(symmetry.astype(np.int64)),
+        score=torch.from_numpy(score),
     )
-    return ObjectSet(label, center, size, rotation, symmetry, score)
 
 
-def _volume(entry: Mapping[str, Any], number: int, arrays: Mapping[str, NDArray[Any]]) -> VoxelVolume:
+def _volume(
+    entry: Mapping[str, Any], number: int, arrays: Mapping[str, NDArray[Any]], num_frames: int
+) -> VoxelVolume:
     x, y, z = entry["resolution"]
     a, b, c = entry["extent"]
-    grid = VoxelGrid((x, y, z), (a, b, c), torch.tensor(entry["center"], dtype=torch.float64))
+    center = torch.from_numpy(as_numbers(entry["center"], (3,), POSITION, "center"))
+    grid = VoxelGrid((x, y, z), (a, b, c), center)
+    frames = [as_count(frame, 0, num_frames - 1, "a frame") for frame in entry["frames"]]
     occupancy = arrays.get(f"volume{number}_occupancy")
     view_count = arrays.get(f"volume{number}_view_count")
     reads = None
     if entry["feature_size"] is not None:
-        offsets, steps, weights = (arrays[f"volume{number}_{n}"] for n in ("offsets", "steps", "weights"))
-        height, width = entry["feature_size"]
-        reads = VoxelReads(offsets, steps, weights, (height, width))
+        reads = _reads(entry["feature_size"], number, arrays, num_voxels=x * y * z, num_views=len(frames))
     return VoxelVolume(
         grid=grid,
-        frames=entry["frames"],
+        frames=frames,
         occupancy=None if occupancy is None else torch.from_numpy(occupancy).reshape(x, y, z) / 255,
         view_count=None if view_count is None else torch.from_numpy(view_count).reshape(x, y, z),
         reads=reads,
     )
+
+
+def _reads(
+    feature_size: Any, number: int, arrays: Mapping[str, NDArray[Any]], *, num_voxels: int, num_views: int
+) -> VoxelReads:
+    """Return which pixels voxels read, after checking that each is one of the volume's views."""
+    offsets, steps, weights = (arrays[f"volume{number}_{n}"] for n in ("offsets", "steps", "weights"))
+    height, width = as_numbers(feature_size, (2,), SIDE, "feature_size").astype(int).tolist()
+    are_whole = all(values.dtype.kind in "iu" and values.ndim == 1 for values in (offsets, steps, weights))
+    if not are_whole or len(steps) != len(weights) or len(offsets) != num_voxels + 1:
+        raise ValueError(f"volume {number} has other arrays than voxels")
+    if offsets[0] != 0 or offsets[-1] != len(steps) or (np.diff(offsets.astype(np.int64)) < 0).any():
+        raise ValueError(f"volume {number} reads other pixels than there are")
+    # The distances of a voxel's pixels add up from its first: no voxel's sum may pass the last pixel.
+    total = np.concatenate([[0], steps.astype(np.int64).cumsum()])
+    if len(steps) and (steps.min() < 0 or np.diff(total[offsets]).max() >= num_views * height * width):
+        raise ValueError(f"volume {number} reads other pixels than there are")
+    return VoxelReads(offsets, steps, weights, (height, width))
 
 
 def find_scenes(folder: Path) -> dict[str, Path]:

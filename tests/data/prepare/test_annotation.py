@@ -29,8 +29,19 @@ def test_a_file_without_faults_comes_as_it_is(write_annotations, cube_entry):
     [
         ({"scale": (1, 1e-9, 1)}, DEGENERATE),
         ({"bbox": [0.0, 0.0, 1.0]}, DEGENERATE),
-        ({"translation": (math.inf, 0, 0)}, "a number is not finite"),
-        ({"bbox": [1, 2]}, "RuntimeError"),
+        ({"translation": (math.inf, 0, 0)}, "translation holds inf"),
+        ({"bbox": [1, 2]}, "bbox does not hold 1x3 numbers"),
+        ({"bbox": [1, 1, 1e300]}, "bbox holds 1e+300"),
+        ({"bbox": "abc"}, "bbox does not hold"),
+        ({"trs": []}, "where an object belongs"),
+        (
+            {
+                "trs": {"rotation": [1, 0, 0, 0], "translation": [0] * 3, "scale": [1e3] * 3},
+                "bbox": [1e3] * 3,
+            },
+            "kilometres",
+        ),
+        ({"id_cad": ["a"] * 10**5}, "['a', 'a', 'a'"),
         ({"sym": None}, "unknown symmetry"),
         ({"id_cad": "a/b"}, "other characters"),
         ({"catid_cad": 3001627}, "other characters"),

@@ -194,9 +194,10 @@ def test_splits_that_are_missing_mixed_or_unreadable(tmp_path) -> None:
         DataError, match=r"1 scans, the first is scene0002_00, are in the train split and in .*_test"
     ):
         read_splits(root)
-    (root / "scannetv2_test.txt").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(DataError, match=r"cannot read the split .*scannetv2_test"):
-        read_splits(root)
+    for content in (b"\xff\xfe\x00", b"scene\xff", b"s" * 1000, b"scene\x1b[2J"):
+        (root / "scannetv2_test.txt").write_bytes(content)
+        with pytest.raises(DataError, match=r"scannetv2_test\.txt"):
+            read_splits(root)
 
 
 def test_real_root(shared_dir) -> None:

@@ -226,7 +226,7 @@ def test_real_scan_with_lost_frames(shared_dir) -> None:
     assert sorted(scan.dropped) == ["255", "605"]
     assert scan.frame_id == tuple(str(n) for n in range(0, 600, 10))
     assert scan.image_size == (480, 640)
-    assert scan.intrinsics[0].tolist() == [577.870605, 0.0, 319.5]
+    assert scan.intrinsics[0, 0].tolist() == [577.870605, 0.0, 319.5]
     # The scan is turned by 4.3° against its walls; poses stay as they are.
     angle = torch.atan2(scan.axis_alignment[1, 0], scan.axis_alignment[0, 0]).rad2deg()
     assert angle.item() == pytest.approx(-4.3, abs=0.05)
@@ -275,6 +275,57 @@ def test_real_walk_is_resized_to_another_aspect(shared_dir) -> None:
     with Image.open(folder / "color" / f"{frame_id[0]}.jpg") as image:
         mean = np.asarray(image, dtype=float).mean(axis=(0, 1))
     np.testing.assert_allclose(views.images[0, 0].float().mean(dim=(1, 2)), mean, atol=1.0)
+
+
+def test_images_of_another_shape_are_dropped_and_those_of_another_size_used(write_scan) -> None:
+    folder = write_scan(frames=range(9))
+    for n, size in ((0, (30, 30)), (2, (32, 48)), (4, (24, 16)), (5, (96, 64)), (7, (32, 48))):
+        Image.new("RGB", size, (n, n, n)).save(folder / "color" / f"{n}.jpg", quality=95)
+    scan = read_scan(folder)
+    assert (scan.image_size, scan.frame_id) == ((32, 48), ("1", "3", "4", "5", "6", "8"))
+    turned = "image turned by 90° against its intrinsics"
+    shape = "image of another shape than its intrinsics are for"
+    assert scan.dropped == {"0": shape, "2": turned, "7": turned}
+    assert scan.intrinsics.shape == (6, 3, 3)
+    assert scan.world_from_camera[:, 0, 3].tolist() == pytest.approx([0.01, 0.03, 0.04, 0.05, 0.06, 0.08])
+    for index, number in ((2, 4), (3, 5)):
+        assert (scan.read_color(index) == number).all()
+        assert scan.read_color(index).shape == (32, 48, 3)
+        assert scan.read_color(index, (8, 16)).shape == (8, 16, 3)
+        assert scan.color_bytes(index) is None
+    assert scan.color_bytes(0) is not None
+    views, used = load_views(folder, image_size=(16, 24), num_views=6)
+    assert used == scan.frame_id
+    assert (views.intrinsics == views.intrinsics[:, :1]).all()
+    assert views.picture is None
+
+
+def test_the_images_that_the_intrinsics_fit_are_used_though_most_are_turned(write_scan) -> None:
+    folder = write_scan(frames=range(5))
+    for n in (0, 2, 4):
+        Image.new("RGB", (32, 48)).save(folder / "color" / f"{n}.jpg")
+    scan = read_scan(folder)
+    assert (scan.image_size, scan.frame_id) == ((32, 48), ("1", "3"))
+    for n in (1, 3):
+        Image.new("RGB", (32, 48)).save(folder / "color" / f"{n}.jpg")
+    with pytest.raises(DataError, match="images turned by 90° against the stored 32x48: give the intrinsics"):
+        read_scan(folder)
+
+
+def test_an_image_whose_header_is_damaged_is_named_when_it_is_read(write_scan) -> None:
+    folder = write_scan(frames=range(4))
+    (folder / "color" / "0.jpg").write_bytes(b"no image")
+    scan = read_scan(folder)
+    assert scan.image_size == (32, 48)
+    assert load_views(folder, image_size=(32, 48), num_views=4)[1] == ("1", "1", "2", "3")
+
+
+def test_intrinsics_of_a_crop(write_scan) -> None:
+    folder = write_scan()
+    matrix = np.diag([40.0, 40, 1, 1])
+    matrix[:2, 2] = (4, 30)
+    np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", matrix)
+    assert read_scan(folder).intrinsics[0, 0, 2] == 4
 
 
 @pytest.mark.parametrize(

@@ -109,7 +109,7 @@ def test_lines_and_points_count_as_announced_faces(tmp_path: Path) -> None:
 def test_models_beyond_any_use_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ending: str
 ) -> None:
-    monkeypatch.setattr(meshes, "_MAX_ELEMENTS", 1000)
+    monkeypatch.setattr(meshes, "MAX_VERTICES", 1000)
     with pytest.raises(DataError, match=r"model\.obj has more than 1,000 vertices or triangles: simplify it"):
         read_obj(put(tmp_path, TRIANGLE + ending))
 

@@ -149,6 +149,7 @@ def test_a_broken_piece_is_left_out_and_named(fields, why, tmp_path, write_libra
 ODD_MESHES = {
     "flat": ("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "flat"),
     "not finite": ("v 0 0 0\nv 1 0 nan\nv 0 1 1\nf 1 2 3\n", "triangles"),
+    "vertices of two numbers": ("v 0 0\nv 1 0\nv 0 1\nv 1 1\nf 1 2 3\nf 1 2 4\n", ""),
     "a corner that is not there": ("v 0 0 0\nv 1 0 0\nv 0 1 1\nf 1 2 9\n", "damaged"),
 }
 
@@ -164,6 +165,16 @@ def test_a_mesh_that_is_none_is_left_out(obj, why, tmp_path, write_library, entr
 def test_a_mesh_of_too_many_triangles_is_left_out(library, tmp_path, monkeypatch):
     monkeypatch.setattr("raytran.rooms.sweethome3d.mesh.MOST_FACES", 35)
     assert "36 triangles" in import_furniture(library, tmp_path, **QUIET).left_out["Scopia#chair"]
+
+
+def test_a_mesh_that_is_packed_as_none_is_is_not_unpacked(tmp_path, write_library, entry):
+    path = write_library(
+        tmp_path / "a.sh3f",
+        entry(1, "Scopia#chair", model="/scopia/odd.obj"),
+        **{"scopia/odd.obj": "\n" * 40_000_000},
+    )
+    report = import_furniture(path, tmp_path / "out", **QUIET)
+    assert "is packed as no model is" in report.left_out["Scopia#chair"]
 
 
 def test_a_mesh_of_hostile_size_is_not_parsed(tmp_path, write_library, entry, monkeypatch):

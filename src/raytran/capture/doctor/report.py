@@ -75,7 +75,7 @@ class CameraReading:
 
     Attributes:
         world_from_camera: ``(n, 4, 4)``.
-        intrinsics: ``(3, 3)`` for the stored images.
+        intrinsics: ``(n, 3, 3)`` for the stored images.
         points: ``(p, 3)`` what the images show, in the same world and unit.
     """
 
@@ -203,7 +203,7 @@ def frames_to_show(
     if not len(examination.objects):
         return [int(section[len(section) // 2]) for section in sections]
     batched = Cameras(
-        torch.from_numpy(cameras.intrinsics).expand(n, 3, 3),
+        torch.from_numpy(cameras.intrinsics),
         torch.from_numpy(cameras.world_from_camera),
         image_size,
     )
@@ -242,7 +242,7 @@ def draw_frames(
         except DataError:
             picture = Image.new("RGB", size[::-1], (90, 90, 90))
         camera = Cameras(
-            torch.from_numpy(cameras.intrinsics),
+            torch.from_numpy(cameras.intrinsics[frame]),
             torch.from_numpy(cameras.world_from_camera[frame]),
             (height, width),
         ).scaled_to(size)

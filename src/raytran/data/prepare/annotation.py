@@ -11,6 +11,7 @@ from typing import Any
 
 from raytran.data.scan2cad import SMALLEST_SCALE, parse_entry, read_entries
 from raytran.errors import DataError
+from raytran.limits import shown
 
 ANNOTATIONS = "full_annotations.json"
 NO_CAD = "no CAD file"
@@ -18,6 +19,9 @@ DEGENERATE = "scale or box of size zero"
 
 Entry = dict[str, Any]
 """One scan's part of ``full_annotations.json``."""
+
+_MAX_SHOWN = 100
+"""Characters of a wrong name that the report shows."""
 
 _PLAIN_NAME = re.compile(r"[\w-]+")
 """Names become names of folders: nothing that leads elsewhere."""
@@ -80,12 +84,11 @@ def read_usable(path: Path) -> Annotations:
     seen: set[str] = set()
     for number, entry in enumerate(read_entries(path)):
         try:
-            scene_id = parse_entry(entry | {"aligned_models": []}).scene_id
-            models = list(entry["aligned_models"])
-            _check_name(scene_id)
-        except (DataError, TypeError, KeyError) as error:
+            scene_id, models = _scene_and_models(entry)
+        except DataError as error:
             name = entry.get("id_scan") if isinstance(entry, dict) else None
-            annotations.left_out.append(LeftOut(str(name or f"entry {number}"), "", str(error)))
+            known = name if isinstance(name, str) and name.isprintable() else ""
+            annotations.left_out.append(LeftOut(known[:_MAX_SHOWN] or f"entry {number}", "", str(error)))
             continue
         if scene_id in seen:
             annotations.twice.append(scene_id)
@@ -104,6 +107,19 @@ def read_usable(path: Path) -> Annotations:
                 entry, [model for model, reason in zip(models, reasons, strict=True) if not reason]
             )
     return annotations
+
+
+def _scene_and_models(entry: Any) -> tuple[str, list[Any]]:
+    """Return the name of an entry's scan, and its models unchecked.
+
+    Raises:
+        DataError: the entry is damaged apart from its models.
+    """
+    if not isinstance(entry, dict) or not isinstance(entry.get("aligned_models"), list):
+        raise DataError("it is no object with a list of aligned_models")
+    scene_id = parse_entry(entry | {"aligned_models": []}).scene_id
+    _check_name(scene_id)
+    return scene_id, entry["aligned_models"]
 
 
 def model_name(model: Mapping[str, Any]) -> str:
@@ -159,12 +175,12 @@ def _reasons_together(entry: Entry, models: list[Any]) -> list[str]:
 
 def _check_name(name: Any) -> None:
     if not isinstance(name, str) or not _PLAIN_NAME.fullmatch(name):
-        raise DataError(f"the name {name!r} has other characters than letters, digits, _ and -")
+        raise DataError(f"the name {shown(name)} has other characters than letters, digits, _ and -")
 
 
 def _name_or_nothing(model: Any) -> str:
     try:
-        return model_name(model)
+        return model_name(model)[:_MAX_SHOWN]
     except (TypeError, KeyError):
         return ""
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from raytran.data.prepare.targets import check_disk, write_masks
 from raytran.data.scan import OpenScan
 from raytran.data.scannet.find import ScanSource
 from raytran.data.scannet.scan import read_scan
+from raytran.data.text import read_json_object
 from raytran.data.views import choose_even
 from raytran.errors import ConfigError, DataError
 from raytran.geometry.camera import Cameras
@@ -90,10 +90,7 @@ def prepare_scan(job: ScanJob, output: Path, settings: PrepareSettings) -> tuple
                 _write_scan(source, folder, settings, tried=reasons)
                 if settings.masks and job.entry is not None:
                     # As a data set sees the cameras: through the files.
-                    scan = read_scan(folder)
-                    intrinsics = scan.intrinsics.expand(len(scan), 3, 3)
-                    cameras = Cameras(intrinsics, scan.world_from_camera, settings.image_size)
-                    write_masks(job.entry, cameras, output)
+                    write_masks(job.entry, read_scan(folder).cameras, output)
             return job.scene_id, None
         except (DataError, OSError) as error:
             check_disk(error, output)
@@ -109,10 +106,10 @@ def read_facts(output: Path, scene_id: str) -> dict[str, Any]:
     """
     path = scan_folder(output, scene_id) / FACTS
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        return read_json_object(path)
+    except DataError as error:
         raise DataError(
-            f"cannot read {path} ({error}): remove the folder of that scan and give the same command again"
+            f"{error}; or remove the folder of that scan and give the same command again"
         ) from error
 
 
@@ -129,8 +126,8 @@ def _write_scan(source: ScanSource, folder: Path, settings: PrepareSettings, *, 
                 "copy or export the scan again"
             )
         pose = scan.world_from_camera[used]
-        cameras = Cameras(scan.intrinsics.expand(len(used), 3, 3), pose, scan.image_size)
-        _write_camera_facts(folder, cameras.scaled_to(settings.image_size), scan.axis_alignment)
+        cameras = scan.cameras[used].scaled_to(settings.image_size)
+        _write_camera_facts(folder, cameras, scan.axis_alignment)
         write_json(
             folder / FACTS,
             {

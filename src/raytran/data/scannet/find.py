@@ -14,6 +14,7 @@ from raytran.data.scan import OpenScan
 from raytran.data.scannet.layout import FORMS, INNER_FOLDERS, WANTED, Listing, find_layout, recognise
 from raytran.data.scannet.scan import read_scan, read_sens
 from raytran.data.scannet.sens import SensFile
+from raytran.data.text import read_names
 from raytran.errors import DataError
 
 _log = logging.getLogger(__name__)
@@ -129,10 +130,7 @@ def read_splits(root: Path) -> dict[str, list[str]]:
         path = next((path for path in candidates if path.is_file()), None)
         if path is None:
             continue
-        try:
-            names = list(dict.fromkeys(path.read_text(encoding="utf-8-sig").split()))
-        except (OSError, UnicodeDecodeError) as error:
-            raise DataError(f"cannot read the split {path} ({error}): download it again") from error
+        names = list(dict.fromkeys(read_names(path)))
         for other, taken in splits.items():
             both = sorted(set(names) & set(taken))
             if both:

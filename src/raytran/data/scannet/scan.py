@@ -4,15 +4,29 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
-from raytran.data.images import decode_image, stored_size
-from raytran.data.scan import NO_IMAGE, NO_MATRIX, NO_POSE, OpenScan, even_views, none_usable, numbers_first
+from raytran.data.images import decode_image, has_shape, is_turned, stored_size, stored_sizes
+from raytran.data.scan import (
+    NO_IMAGE,
+    NO_MATRIX,
+    NO_POSE,
+    OTHER_SHAPE,
+    TURNED,
+    OpenScan,
+    even_views,
+    none_usable,
+    numbers_first,
+)
 from raytran.data.scannet.layout import Layout, Listing, find_layout, recognise
 from raytran.data.scannet.sens import SensFile
 from raytran.data.scannet.text import (
@@ -33,6 +47,9 @@ _log = logging.getLogger(__name__)
 CUT = "the file ends here"
 """Reason why the frames after the end of a damaged recording are dropped."""
 
+_SIZES_TRIED = 8
+"""Most sizes of images to which the intrinsics of a folder are held."""
+
 _MAX_APART, _OTHER_SIZE = 0.01, 0.2
 """Relative differences between two files of intrinsics: from the first on it is said, from the second on they
 are for images of other sizes."""
@@ -47,18 +64,23 @@ class Scan(OpenScan):
     Attributes:
         folder: where it lies.
         image_path: file of each usable frame.
+        other_size: ``(H, W)`` of the images that are not stored in ``image_size``, by their position; they
+            have the same aspect.
     """
 
     folder: Path
     image_path: tuple[Path, ...]
+    other_size: dict[int, tuple[int, int]] = field(default_factory=dict)
 
     @property
     def path(self) -> Path:
         """The scan's folder."""
         return self.folder
 
-    def color_bytes(self, index: int) -> bytes:
+    def color_bytes(self, index: int) -> bytes | None:
         """See ``OpenScan``."""
+        if index in self.other_size:
+            return None
         path = self.image_path[index]
         try:
             return path.read_bytes()
@@ -70,7 +92,9 @@ class Scan(OpenScan):
     def read_color(self, index: int, image_size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
         """See ``OpenScan``."""
         path = self.image_path[index]
-        image = decode_image(path, name=str(path), image_size=image_size, stored=self.image_size)
+        stored = self.other_size.get(index, self.image_size)
+        size = image_size or (self.image_size if index in self.other_size else None)
+        image = decode_image(path, name=str(path), image_size=size, stored=stored)
         return image.permute(1, 2, 0).numpy()
 
     def close(self) -> None:
@@ -116,8 +140,9 @@ def read_scan(
 ) -> Scan:
     """Read a scan's cameras and the list of its frames; images are read later.
 
-    A frame without an image or with a pose that is no rigid motion (ScanNet writes ``-inf`` where tracking
-    was lost) is dropped, and the reason is recorded.
+    A frame without an image, with a pose that is no rigid motion (ScanNet writes ``-inf`` where tracking was
+    lost), or with an image of another shape than the intrinsics are for is dropped, and the reason is
+    recorded. Images of the same shape in another size are used: the intrinsics follow.
 
     Args:
         folder: a scan in one of the exported forms of ``layout.FORMS``.
@@ -147,25 +172,56 @@ def read_scan(
         raise none_usable(folder, dropped)
     header = header or folder / f"{folder.name}.txt"
     facts = read_header(header)
-    image_size = stored_size([images[name] for name in names])
+    found = stored_sizes([images[name] for name in names])
     matrix, intrinsics_file = _intrinsics(layout, header, facts, intrinsics)
+    image_size, of_all = _fitting_size(
+        [size for size in found if size is not None] or [stored_size([images[name] for name in names])],
+        partial(
+            check_intrinsics,
+            matrix,
+            intrinsics_file,
+            header=facts,
+            any_size=any_size,
+        ),
+    )
+    # An image whose header cannot be read is named when it is read.
+    sizes = [size or image_size for size in found]
+    fits = [has_shape(size, image_size) for size in sizes]
+    for name, size, has_right_shape in zip(names, sizes, fits, strict=True):
+        if not has_right_shape:
+            dropped[name] = TURNED if is_turned(size, image_size) else OTHER_SHAPE
+    names = [name for name, has_right_shape in zip(names, fits, strict=True) if has_right_shape]
+    sizes = [size for size in sizes if has_shape(size, image_size)]
     return Scan(
         scene_id=folder.name,
         folder=folder,
         frame_id=tuple(names),
         image_path=tuple(images[name] for name in names),
-        world_from_camera=torch.from_numpy(poses[[fault is None for fault in faults]]),
-        intrinsics=check_intrinsics(
-            matrix,
-            intrinsics_file,
-            image_size=image_size,
-            header=facts,
-            any_size=any_size,
-        ),
+        world_from_camera=torch.from_numpy(poses[[fault is None for fault in faults]][fits]),
+        # In images of one aspect, brought to one size, all have the same.
+        intrinsics=of_all.expand(len(names), 3, 3),
         image_size=image_size,
+        other_size={i: size for i, size in enumerate(sizes) if size != image_size},
         axis_alignment=axis_alignment(facts, header),
         dropped={name: dropped[name] for name in sorted(dropped, key=numbers_first)},
     )
+
+
+def _fitting_size(
+    sizes: Sequence[tuple[int, int]], check: Callable[..., Tensor]
+) -> tuple[tuple[int, int], Tensor]:
+    """Return the most frequent size of images that the intrinsics fit, and the intrinsics.
+
+    Raises:
+        DataError: they fit none; the error is that of the most frequent size.
+    """
+    first_error: DataError | None = None
+    for size, _ in Counter(sizes).most_common(_SIZES_TRIED):
+        try:
+            return size, check(image_size=size)
+        except DataError as error:
+            first_error = first_error or error
+    raise first_error or DataError("a scan without images has no intrinsics")
 
 
 def _intrinsics(
@@ -253,7 +309,7 @@ def read_sens(
                 image_size=file.color_size,
                 header=facts,
                 any_size=any_size,
-            ),
+            ).expand(len(usable), 3, 3),
             image_size=file.color_size,
             axis_alignment=axis_alignment(facts, header),
             dropped=dropped,

@@ -10,9 +10,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from raytran.data.images import is_turned
 from raytran.data.scan import EMPTY, LEFT_HANDED, LOST, SCALED, SKEWED
 from raytran.data.text import read_table
 from raytran.errors import DataError
+from raytran.geometry.camera import FARTHEST_CENTER, center_offset, other_image_size
+from raytran.geometry.checks import rigid_motions
 from raytran.limits import FOCAL_LENGTH, POSITION
 
 INFO_FILES = ("_info.txt", "info.txt")
@@ -20,9 +23,6 @@ INFO_FILES = ("_info.txt", "info.txt")
 
 _MAX_BYTES = 1 << 20
 """Bytes of a file that are read; ScanNet's files have some hundred."""
-
-_MAX_OFFSET = 0.15
-"""Largest distance of the principal point from the image centre, in widths or heights."""
 
 
 def read_matrix(path: Path) -> NDArray[np.float64] | None:
@@ -47,10 +47,8 @@ def read_pose(path: Path) -> NDArray[np.float64] | None:
 
 def are_rigid(poses: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which of ``(n, 4, 4)`` matrices are finite and hold a rotation in their upper left, ``(n,)``."""
-    finite = _are_within(poses)
-    rotation = np.where(finite[:, None, None], poses[:, :3, :3], 0.0)
-    error = np.abs(rotation @ rotation.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
-    return finite & (error < 0.01) & (np.linalg.det(rotation) > 0)
+    is_rigid: NDArray[np.bool_] = rigid_motions(torch.from_numpy(poses)).numpy() & _are_within(poses)
+    return is_rigid
 
 
 def pose_faults(poses: NDArray[np.float64]) -> list[str | None]:
@@ -189,18 +187,27 @@ def check_intrinsics(
     if any_size:
         return torch.from_numpy(matrix[:3, :3].copy())
     height, width = image_size
-    distance = _distance_from_centre(matrix, width, height)
+    center = float(matrix[0, 2]), float(matrix[1, 2])
+    distance = center_offset(center, image_size)
     try:
         stated = int(header.get("colorWidth", width)), int(header.get("colorHeight", height))
     except ValueError:
         stated = width, height
     # A header may state 0 for a size it does not know.
     fits_stated_size = (
-        min(stated) > 0 and stated != (width, height) and _distance_from_centre(matrix, *stated) < distance
+        min(stated) > 0
+        and stated != (width, height)
+        and center_offset(center, (stated[1], stated[0])) < distance
     )
-    if distance > _MAX_OFFSET or fits_stated_size:
+    other = other_image_size(center, image_size)
+    if other is not None and is_turned(other, image_size):
         raise DataError(
-            f"{path} has its principal point at ({matrix[0, 2]:.1f}, {matrix[1, 2]:.1f}), so it is for "
+            f"{path} has its principal point at ({center[0]:.1f}, {center[1]:.1f}), so it is for images "
+            f"turned by 90° against the stored {width}x{height}: give the intrinsics of the stored images"
+        )
+    if other is not None or distance > FARTHEST_CENTER or fits_stated_size:
+        raise DataError(
+            f"{path} has its principal point at ({center[0]:.1f}, {center[1]:.1f}), so it is for "
             f"another image size than the stored {width}x{height}: "
             "scale its first row by W'/W and its second by H'/H"
         )
@@ -222,7 +229,3 @@ def _matrix(values: NDArray[np.float64]) -> NDArray[np.float64]:
         matrix[:3] = values.reshape(3, 4)
         return matrix
     return values.reshape(4, 4)
-
-
-def _distance_from_centre(matrix: NDArray[np.float64], width: int, height: int) -> float:
-    return max(abs(matrix[0, 2] / width - 0.5), abs(matrix[1, 2] / height - 0.5))

@@ -22,20 +22,21 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from raytran.errors import DataError
+from raytran.limits import COORDINATE, VOXEL_CUBE, as_number, as_numbers, shown
 
 _log = logging.getLogger(__name__)
 
-_MAX_ELEMENTS = 10_000_000
+MAX_VERTICES = 10_000_000
 """Most vertices, and most triangles, of a model that is read."""
-
-_MAX_COORDINATE = 1e100
-"""Coordinates at or beyond this, and those that are no number, count as damage: their box would overflow."""
 
 _MAX_LINE_BYTES = 1 << 20
 """Longest line that is read, bytes."""
 
 # What the converter of ShapeNetCore v2 (assimp) says of its own file. It counts lines and points as faces.
 _ANNOUNCED = re.compile(rb"# (?:Mesh '.*' with )?(\d+) (vertex positions|faces)\s*$")
+
+_DIGITS = 12
+"""Digits of an announced number that count: none is as large."""
 
 _GREY = (0.7, 0.7, 0.7)
 """Colour of what has none that can be read."""
@@ -74,15 +75,17 @@ def read_obj(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     except OSError as error:
         raise DataError(f"cannot read the CAD model {path}: {error.strerror}; restore the file") from error
     except (ValueError, OverflowError) as error:
-        raise DataError(f"the CAD model {path} is damaged: {error}; restore the file") from error
+        raise DataError(f"the CAD model {path} is damaged: {str(error)[:80]}; restore the file") from error
     if announced:
         raise DataError(f"the CAD model {path} ends early: {announced}; restore the file")
     points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
     faces = np.array(corners, dtype=np.int64).reshape(-1, 3)
     if not len(faces) or faces.min() < 0 or faces.max() >= len(points):
         raise DataError(f"the CAD model {path} has no faces or misses vertices; restore the file")
-    if not (np.abs(points) < _MAX_COORDINATE).all():
-        raise DataError(f"the CAD model {path} has vertices that are not finite; restore the file")
+    if not (np.abs(points) <= COORDINATE.high).all():
+        raise DataError(
+            f"the CAD model {path} has vertices that are not finite, or far off; restore the file"
+        )
     return points, faces
 
 
@@ -132,10 +135,10 @@ def _parse(path: Path, vertices: array[float], corners: array[int]) -> str:
         elif kind in (b"l", b"p"):
             elements += 1
         elif kind == b"#" and (match := _ANNOUNCED.match(line)):
-            expected[match[2]] += int(match[1])
-        if max(len(vertices), len(corners)) > 3 * _MAX_ELEMENTS:
+            expected[match[2]] += int(match[1][:_DIGITS])
+        if max(len(vertices), len(corners)) > 3 * MAX_VERTICES:
             raise DataError(
-                f"the CAD model {path} has more than {_MAX_ELEMENTS:,} vertices or triangles: simplify it or "
+                f"the CAD model {path} has more than {MAX_VERTICES:,} vertices or triangles: simplify it or "
                 "leave it out"
             )
     counted = {b"vertex positions": len(vertices) // 3, b"faces": elements}
@@ -311,14 +314,20 @@ def read_binvox(path: Path) -> tuple[NDArray[np.bool_], NDArray[np.float64], flo
             or not 0 < size <= _MAX_CELLS_A_SIDE
             or int(runs[:, 1].sum(dtype=np.int64)) != size**3
         ):
-            raise ValueError(f"its runs do not fill {' × '.join(fields['dim'])} cells")
+            raise ValueError(f"its runs do not fill {shown(' × '.join(fields['dim']))} cells")
         # The file runs over x, then z, then y (fastest).
         cells = np.repeat(runs[:, 0] > 0, runs[:, 1]).reshape(size, size, size).transpose(0, 2, 1)
-        return cells, np.array(fields["translate"], dtype=np.float64), float(fields["scale"][0])
+        where = f"in {path}"
+        translate = [float(word) for word in fields["translate"]]
+        return (
+            cells,
+            as_numbers(translate, (3,), COORDINATE, f"translate {where}"),
+            as_number(float(fields["scale"][0]), VOXEL_CUBE, f"scale {where}"),
+        )
     except OSError as error:
         raise DataError(f"cannot read the voxels {path}: {error.strerror}; restore the file") from error
     except (ValueError, KeyError, IndexError) as error:
-        raise DataError(f"the voxel file {path} is damaged ({error}); restore the file") from error
+        raise DataError(f"the voxel file {path} is damaged ({str(error)[:80]}); restore the file") from error
 
 
 def write_binvox(path: Path, cells: NDArray[np.bool_], translate: ArrayLike, scale: float) -> None:

@@ -23,8 +23,10 @@ import trimesh
 from numpy.typing import NDArray
 
 from raytran.data.files import finished_folder
-from raytran.data.shapenet.meshes import read_binvox, read_obj, replaced_obj, write_binvox
+from raytran.data.shapenet.meshes import MAX_VERTICES, read_binvox, read_obj, replaced_obj, write_binvox
+from raytran.data.text import read_json_object
 from raytran.errors import DataError
+from raytran.limits import COORDINATE, as_count, as_numbers
 
 _log = logging.getLogger(__name__)
 
@@ -46,6 +48,9 @@ _MESHES: tuple[tuple[str, Version], ...] = (
     ("model.obj", "v1"),
     ("models/model.obj", "v1"),
 )
+_LEAST_DIAGONAL = 1e-12
+"""Of a box, in the unit of the file: what is smaller is one point, whose size cannot be made 1."""
+
 _MAX_FACTS = 2**20
 """Bytes of the largest ``.json`` that is read; ShapeNet's have less than one kilobyte."""
 
@@ -154,18 +159,13 @@ def read_facts(root: Path, catid: str, model_id: str) -> ModelFacts:
     if version == "v1":
         return _facts_of_v1(path, read_obj(path)[0])
     path = path.with_suffix(".json")
-    try:
-        if path.stat().st_size > _MAX_FACTS:
-            raise ValueError("it is larger than a megabyte")
-        values = json.loads(path.read_text(encoding="utf-8"))
-        low, high, centroid = (np.array(values[key], dtype=np.float64) for key in ("min", "max", "centroid"))
-        if {low.shape, high.shape, centroid.shape} != {(3,)}:
-            raise ValueError("min, max and centroid must have three numbers each")
-        return ModelFacts(int(values["numVertices"]), low, high, centroid)
-    except OSError as error:
-        raise DataError(f"cannot read {path}: {error.strerror}; restore the file") from error
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise DataError(f"the file {path} is damaged ({error}); restore it") from error
+    values = read_json_object(path, max_bytes=_MAX_FACTS)
+    low, high, centroid = (
+        as_numbers(values.get(key), (3,), COORDINATE, f"{key} in {path}")
+        for key in ("min", "max", "centroid")
+    )
+    count = as_count(values.get("numVertices"), 0, MAX_VERTICES, f"numVertices in {path}")
+    return ModelFacts(count, low, high, centroid)
 
 
 def copy_model(root: Path, catid: str, model_id: str, output_root: Path) -> Path:
@@ -222,7 +222,7 @@ def _mesh_below(model: Path) -> tuple[Path, Version] | None:
 def _facts_of_v1(path: Path, vertices: NDArray[np.float64]) -> ModelFacts:
     turned = vertices @ V2_FROM_V1.T
     low, high = turned.min(axis=0), turned.max(axis=0)
-    if not np.linalg.norm(high - low) > 0:
+    if not np.linalg.norm(high - low) > _LEAST_DIAGONAL:
         raise DataError(f"the CAD model {path} has all its vertices in one point; restore the file")
     return ModelFacts(len(turned), low, high, turned.mean(axis=0))
 

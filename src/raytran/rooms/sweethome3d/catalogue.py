@@ -28,6 +28,9 @@ LARGEST_ENTRY = 64 * 2**20
 
 _CATALOGUE = "PluginFurnitureCatalog.properties"
 _LICENCE = "LICENSE.TXT"
+
+_MOST_UNPACKED = 100
+"""Bytes of an entry for each byte that it is packed into: text of models has some ten."""
 _KEY_VALUE = re.compile(r"([^=:\s]+)\s*[=:]\s*(.*)")
 _ESCAPE = re.compile(r"\\(u[0-9a-fA-F]{4}|.)")
 _SIZES = ("width", "height", "depth")
@@ -103,6 +106,8 @@ class FurnitureLibrary:
                     f"{name} in {self.path} claims {entry.file_size / 2**20:.0f} MB; "
                     f"more than {LARGEST_ENTRY / 2**20:.0f} MB is no furniture"
                 )
+            if entry.file_size > _MOST_UNPACKED * entry.compress_size + 2**24:
+                raise DataError(f"{name} in {self.path} is packed as no model is: copy the library again")
             return self._zip.read(entry)
         except KeyError as error:
             raise DataError(f"{self.path} has no {name}; copy the library again") from error

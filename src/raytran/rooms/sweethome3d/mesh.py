@@ -66,15 +66,23 @@ def read_piece(library: FurnitureLibrary, piece: Piece, turn_deg: float = 0.0) -
         )
     try:
         resolver = library.files_beside(piece.model)
-        scene = trimesh.load_scene(io.BytesIO(data), file_type="obj", resolver=resolver)
+        with np.errstate(all="ignore"):  # what numbers there are is looked at below
+            scene = trimesh.load_scene(io.BytesIO(data), file_type="obj", resolver=resolver)
     except (ValueError, IndexError, KeyError, TypeError, OSError, Image.DecompressionBombError) as error:
-        raise DataError(f"{piece.model} in {library.path} is damaged ({error}); copy it again") from error
+        raise DataError(
+            f"{piece.model} in {library.path} is damaged ({str(error)[:80]!r}); copy it again"
+        ) from error
     parts = [
         part for part in scene.geometry.values() if isinstance(part, trimesh.Trimesh) and len(part.faces)
     ]
     count = sum(len(part.faces) for part in parts)
     if not 0 < count <= MOST_FACES:
         raise DataError(f"{piece.model} in {library.path} has {count} triangles, not 1 to {MOST_FACES}")
+    if any(
+        part.vertices.shape[1:] != (3,) or part.faces.min() < 0 or part.faces.max() >= len(part.vertices)
+        for part in parts
+    ):
+        raise DataError(f"{piece.model} in {library.path} has faces of vertices that it lacks; copy it again")
     triangles = np.concatenate([part.vertices[part.faces] for part in parts])
     vertices, index = np.unique(_placed(triangles, piece, turn_deg), axis=0, return_inverse=True)
     if not np.isfinite(vertices).all():

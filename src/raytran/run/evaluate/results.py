@@ -14,7 +14,9 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
-from raytran.errors import ConfigError
+from raytran.data.text import read_json_object
+from raytran.errors import ConfigError, DataError
+from raytran.limits import POSITION, SHARE, as_numbers
 from raytran.metrics.per_scene import Row
 from raytran.pictures.accuracy_curves import FILE as FIGURE
 from raytran.pictures.accuracy_curves import draw_accuracy_curves
@@ -119,9 +121,9 @@ def read_curves(folders: Iterable[str | Path]) -> dict[str, Curves]:
     for folder in folders:
         path = Path(folder) / MARKER
         try:
-            curves = json.loads(path.read_text(encoding="utf-8"))["strict"]["curves"]
+            curves = read_json_object(path)["strict"]["curves"]
             _check_curves(curves)
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (DataError, ValueError, KeyError, TypeError) as error:
             raise ConfigError(
                 f"{path} has no curves of protocol strict to draw ({type(error).__name__}): draw_with= takes "
                 "folders that raytran.evaluate wrote with protocol=strict or all, or for a checkpoint"
@@ -133,9 +135,11 @@ def read_curves(folders: Iterable[str | Path]) -> dict[str, Curves]:
 def _check_curves(curves: Curves) -> None:
     """Raise unless each curve has as many numbers as thresholds."""
     for name in ("translation", "rotation", "scale", "joint"):
-        columns = [curves[name]["threshold"], curves[name]["class_average"]]
-        lengths = {len([float(value) for value in column]) for column in columns}
-        if len(lengths) != 1 or 0 in lengths:
+        columns = [
+            as_numbers(curves[name][column], (-1,), quantity, column)
+            for column, quantity in (("threshold", POSITION), ("class_average", SHARE))
+        ]
+        if len(columns[0]) != len(columns[1]) or not len(columns[0]):
             raise ValueError(name)
 
 

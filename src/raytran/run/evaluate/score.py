@@ -14,6 +14,7 @@ from torch import Tensor
 
 from raytran.data.scan2cad import SceneAnnotation, read_annotations, scene_alignments, scene_objects
 from raytran.data.scannet.scan import read_scan
+from raytran.data.text import read_names
 from raytran.errors import ConfigError, DataError
 from raytran.export.read import CadBoxes, PredictionFiles, read_predictions
 from raytran.metrics.bootstrap import (
@@ -173,11 +174,8 @@ def _of_split(
 ) -> dict[str, SceneAnnotation]:
     if split is None:
         return dict(scenes)
-    try:
-        names = split.read_text(encoding="utf-8").split()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"cannot read the scene names split={split} ({error}): check the path") from error
-    chosen = {name: scene for name, scene in scenes.items() if name in set(names)}
+    names = set(read_names(split))
+    chosen = {name: scene for name, scene in scenes.items() if name in names}
     if not chosen:
         raise DataError(f"none of the {len(names)} scenes that {split} names is annotated in {annotations}")
     return chosen

@@ -10,6 +10,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from raytran.checkpoints.file import PREFIX, SUFFIX, checkpoint_path, export_weights, read_checkpoint
@@ -82,11 +83,12 @@ def described(checkpoint: Mapping[str, Any], path: Path) -> Table:
         "WARNING": "; ".join(checkpoint.get("warnings") or ()) or None,
         **{name: score for name, score in (checkpoint.get("scores") or {}).items() if _is_summary(name)},
     }
-    table = Table("", "", title=str(path), show_header=False)
+    # What a file says may look like Rich's markup.
+    table = Table("", "", title=escape(str(path)), show_header=False)
     table.columns[1].overflow = "fold"
     for name, value in rows.items():
         if value is not None:
-            table.add_row(name, f"{value:.4g}" if isinstance(value, float) else str(value))
+            table.add_row(escape(name), f"{value:.4g}" if isinstance(value, float) else escape(str(value)))
     return table
 
 

@@ -21,7 +21,7 @@ from raytran.errors import ConfigError
 from raytran.model import RayTran
 from raytran.postprocess import count_object_views, merge_volumes, object_meshes, select_objects
 from raytran.run.device import choose_device, set_matmul_precision
-from raytran.run.output import check_replaceable
+from raytran.run.output import one_writer
 from raytran.run.predict.new_views import cameras_to_render, render_views
 from raytran.run.predict.room import RoomViews, check_choice, read_room
 from raytran.run.predict.write_scene import MARKER, PredictedScene, check_pictures, write_scene
@@ -67,7 +67,14 @@ def predict(cfg: DictConfig) -> Path:
     intrinsics = parse_intrinsics(cfg.get("intrinsics"))
     check_choice(cfg.frames, cfg.num_views)
     check_pictures(num_overlays=cfg.num_overlays, turntable=cfg.turntable)
-    check_replaceable(output.resolve(), marker=MARKER)
+    with one_writer(output, marker=MARKER):
+        return _predict(cfg, recording, output, world, intrinsics)
+
+
+def _predict(
+    cfg: DictConfig, recording: Path, output: Path, world: WorldSettings, intrinsics: Intrinsics | None
+) -> Path:
+    """Predict with settings that were checked, into a folder that nobody else writes."""
     if cfg.cads:
         shapenet_version(Path(cfg.cads))  # It raises where there are none, before the network runs.
     settings = prediction_settings(cfg.checkpoint)

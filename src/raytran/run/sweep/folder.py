@@ -7,7 +7,6 @@ one of its jobs. ``sweep.json`` holds the command and, for each job, its setting
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping, Sequence
 from datetime import datetime
@@ -18,7 +17,8 @@ from omegaconf import OmegaConf
 
 from raytran.checkpoints.runs import read_finished
 from raytran.data.files import write_json
-from raytran.errors import ConfigError
+from raytran.data.text import read_json_object
+from raytran.errors import ConfigError, DataError
 
 RECORD = "sweep.json"
 THIS_SWEEP = "RAYTRAN_SWEEP_DIR"
@@ -61,13 +61,33 @@ def read_record(folder: Path) -> dict[str, Any]:
         ConfigError: the file is damaged.
     """
     path = folder / RECORD
+    damaged = ConfigError(f"{path} is damaged: delete it, or start a new sweep with launcher.resume=none")
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
-        return {"command": list(record["command"]), "jobs": [dict(job) for job in record["jobs"]]}
-    except (ValueError, TypeError, KeyError) as error:
-        raise ConfigError(
-            f"{path} is damaged: delete it, or start a new sweep with launcher.resume=none"
-        ) from error
+        record = read_json_object(path)
+    except DataError as error:
+        raise damaged from error
+    command, jobs = record.get("command"), record.get("jobs")
+    if not _are_texts(command) or not isinstance(jobs, list):
+        raise damaged
+    for job in jobs:
+        is_job = isinstance(job, dict) and _is_below(job.get("folder")) and _are_texts(job.get("overrides"))
+        if not is_job:
+            raise damaged
+    return {"command": command, "jobs": jobs}
+
+
+def _is_below(folder: Any) -> bool:
+    """Say whether it is the path of a folder in another, which does not lead out of that."""
+    return (
+        isinstance(folder, str)
+        and folder.isprintable()
+        and not Path(folder).is_absolute()
+        and ".." not in Path(folder).parts
+    )
+
+
+def _are_texts(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(item, str) for item in value)
 
 
 def write_record(
