@@ -172,3 +172,8 @@ def test_pictures_of_a_wrong_shape():
 )
 def test_for_which_other_images_intrinsics_are(center, size, other):
     assert other_image_size(center, size) == other
+
+
+def test_a_principal_point_in_the_corner_is_that_of_no_image() -> None:
+    assert other_image_size((0.2, 0.15), (48, 64)) is None
+    assert other_image_size((320.0, 240.0), (48, 64)) == (480, 640)

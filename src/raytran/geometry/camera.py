@@ -241,7 +241,7 @@ def other_image_size(center: tuple[float, float], image_size: tuple[int, int]) -
         image_size: ``(H, W)`` of the images.
     """
     width, height = 2 * center[0], 2 * center[1]
-    if not is_off_center(center, image_size) or min(width, height) <= 0:
+    if not is_off_center(center, image_size) or min(width, height) < 1:
         return None
     aspect = image_size[1] / image_size[0]
     same = any(abs(width / height / other - 1) < _SAME for other in (aspect, 1 / aspect, 1.0))
