@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from raytran.capture.lens import Lens, check_lens, opencv_lens
 from raytran.capture.recording import (
-    IMAGE_ENDINGS,
     Frame,
     Recording,
     frame_name,
@@ -28,7 +27,7 @@ from raytran.capture.recording import (
     read_json,
     unposed_images,
 )
-from raytran.data.images import stored_size
+from raytran.data.images import IMAGE_ENDINGS, stored_size
 from raytran.errors import DataError
 
 NAMES = ("transforms.json", "transforms_train.json")

@@ -12,7 +12,8 @@ import os
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
@@ -21,7 +22,15 @@ import torch
 from numpy.typing import NDArray
 
 from raytran.capture.lens import Lens, check_lens, needs_resampling, resample, shared_pinhole
-from raytran.data.images import decode_image, stored_size
+from raytran.data.images import (
+    IMAGE_ENDINGS,
+    ImageHeader,
+    OrientationTags,
+    decode_image,
+    kept_bytes,
+    read_header,
+    white_level,
+)
 from raytran.data.scan import LOST, NO_IMAGE, NO_POSE, OpenScan, numbers_first
 from raytran.data.scannet.text import are_rigid
 from raytran.errors import DataError
@@ -31,8 +40,6 @@ Axes = Literal["opencv", "opengl"]
 
 UNREADABLE = "image cannot be read"
 """Reason for which a frame is dropped, beside those of ``raytran.data.scan``."""
-
-IMAGE_ENDINGS = (".jpg", ".jpeg", ".png")
 
 _SAME_ASPECT = 0.01
 _MAX_JSON_BYTES = 64 * 2**20
@@ -68,6 +75,7 @@ class Recording:
         axes: camera axes of the poses.
         up: direction of up in the world, ``(3,)``, if the format promises one.
         metric: whether the format promises metres.
+        honours_exif: whether its programs turn images by their EXIF orientation before they work on them.
         dropped: reason for each image without a pose and each pose without an image.
     """
 
@@ -77,11 +85,21 @@ class Recording:
     axes: Axes = "opencv"
     up: tuple[float, float, float] | None = None
     metric: bool = False
+    honours_exif: bool = False
     dropped: dict[str, str] = field(default_factory=dict)
 
 
 class FrameImages(ABC):
     """The images of a recording's frames, read one by one."""
+
+    @property
+    def tags(self) -> OrientationTags | None:
+        """Which side of each is up by its file, if a file says that it is not the top."""
+        return None
+
+    def with_tags(self, tags: OrientationTags) -> FrameImages:
+        """Return the same images, turned as ``tags`` says when they are read."""
+        raise NotImplementedError
 
     @abstractmethod
     def read(
@@ -94,7 +112,7 @@ class FrameImages(ABC):
         """
 
     def encoded(self, index: int) -> bytes | None:
-        """Return the JPEG or PNG as stored, or None if it is none.
+        """Return the file's content, if that is a JPEG or PNG whose pixels are used as they are, else None.
 
         Raises:
             DataError: it cannot be read.
@@ -111,23 +129,49 @@ class ImageFiles(FrameImages):
     """Images in files of their own."""
 
     paths: tuple[Path, ...]
+    orientations: OrientationTags | None = None
+
+    @property
+    def tags(self) -> OrientationTags | None:
+        """See ``FrameImages``."""
+        return self.orientations
+
+    def with_tags(self, tags: OrientationTags) -> ImageFiles:
+        """See ``FrameImages``."""
+        return replace(self, orientations=tags)
 
     def read(
         self, index: int, image_size: tuple[int, int] | None, stored: tuple[int, int]
     ) -> NDArray[np.uint8]:
         """See ``FrameImages``."""
         path = self.paths[index]
-        image = decode_image(path, name=str(path), image_size=image_size, stored=stored)
+        image = decode_image(
+            path,
+            name=str(path),
+            image_size=image_size,
+            stored=stored,
+            orientation=self._turn(index),
+            white=lambda: self._white,
+        )
         return image.permute(1, 2, 0).numpy()
 
     def encoded(self, index: int) -> bytes | None:
         """See ``FrameImages``."""
+        if self._turn(index) != 1:
+            return None
         try:
-            return self.paths[index].read_bytes()
+            return kept_bytes(self.paths[index].read_bytes())
         except OSError as error:
             raise DataError(
                 f"cannot read the image {self.paths[index]} ({error.strerror}): copy or export it again"
             ) from error
+
+    @cached_property
+    def _white(self) -> int:
+        return white_level(self.paths)
+
+    def _turn(self, index: int) -> int:
+        return 1 if self.orientations is None else self.orientations.turn(index)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,16 +219,38 @@ def open_recording(recording: Recording) -> RecordedScan:
     Raises:
         DataError: see ``build_scan``.
     """
+    turns: dict[Path, tuple[int, bool]] = {}
 
     def size_of(frame: Frame) -> tuple[int, int] | str:
         if not frame.image.is_file():
             return NO_IMAGE
         try:
-            return stored_size([frame.image])
+            header = read_header(frame.image)
         except DataError:
             return UNREADABLE
+        is_turned = _is_for_shown(frame.lens.size, header, default=recording.honours_exif)
+        turns[frame.image] = header.orientation, is_turned
+        return header.shown_size if is_turned else header.size
 
-    return build_scan(recording, size_of, lambda frames: ImageFiles(tuple(frame.image for frame in frames)))
+    def open_images(frames: list[Frame]) -> ImageFiles:
+        paths = tuple(frame.image for frame in frames)
+        orientation, applied = zip(*(turns[path] for path in paths), strict=True)
+        has_tags = any(tag != 1 for tag in orientation)
+        return ImageFiles(paths, OrientationTags(orientation, applied) if has_tags else None)
+
+    return build_scan(recording, size_of, open_images)
+
+
+def _is_for_shown(size: tuple[int, int], header: ImageHeader, *, default: bool) -> bool:
+    """Whether intrinsics for ``size`` (H, W) are for the image turned by its EXIF orientation.
+
+    Where the aspect does not tell, the format's default does.
+    """
+    fits_shown, fits_stored = (
+        abs((of_image[1] / of_image[0]) / (size[1] / size[0]) - 1) <= _SAME_ASPECT
+        for of_image in (header.shown_size, header.size)
+    )
+    return header.orientation != 1 and (default if fits_shown == fits_stored else fits_shown)
 
 
 def build_scan(
@@ -269,7 +335,7 @@ def frame_name(image: str) -> str:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """Return the JPEG and PNG files in a folder, in the order of the numbers in their names."""
+    """Return the images in a folder, in the order of the numbers in their names."""
     images = [path for path in folder.iterdir() if path.suffix.lower() in IMAGE_ENDINGS]
     return sorted(images, key=lambda path: numbers_first(path.name))
 

@@ -72,7 +72,7 @@ class OpenScan(ABC):
 
     @abstractmethod
     def color_bytes(self, index: int) -> bytes | None:
-        """Return usable frame ``index`` as stored, if that is a JPEG or PNG, else None.
+        """Return usable frame ``index`` as stored, if it is a JPEG or PNG that is used as it is, else None.
 
         Raises:
             DataError: it cannot be read.

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from raytran.data.images import open_image
 from raytran.errors import DataError
 from raytran.export import read_scene_json
 from raytran.geometry.camera import Cameras
@@ -308,14 +309,14 @@ def _read_mesh(path: Path) -> trimesh.Trimesh | None:
     if not path.is_file():
         return None
     try:
-        mesh = trimesh.load_mesh(path, process=False)
+        mesh = trimesh.load_mesh(path, process=False, skip_materials=True)
     except Exception as error:  # trimesh raises whatever its parser stumbles over
         raise DataError(f"cannot read the mesh {path} ({error}): predict again") from error
     return mesh
 
 
 def _image(content: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    with Image.open(io.BytesIO(content.tobytes())) as image:
+    with open_image(content.tobytes()) as image:
         return np.asarray(image.convert("RGB"))
 
 

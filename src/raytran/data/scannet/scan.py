@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from raytran.data.images import decode_image, stored_size
+from raytran.data.images import OrientationTags, decode_image, kept_bytes, stored_size, white_level
 from raytran.data.scan import LOST, NO_IMAGE, NO_POSE, OpenScan, even_views, numbers_first
 from raytran.data.scannet.layout import Listing, find_layout, recognise
 from raytran.data.scannet.sens import SensFile
@@ -41,21 +42,25 @@ class Scan(OpenScan):
     Attributes:
         folder: where it lies.
         image_path: file of each usable frame.
+        tags: EXIF orientations of the images, if any is known; None: they are read as they are stored.
     """
 
     folder: Path
     image_path: tuple[Path, ...]
+    tags: OrientationTags | None = None
 
     @property
     def path(self) -> Path:
         """The scan's folder."""
         return self.folder
 
-    def color_bytes(self, index: int) -> bytes:
+    def color_bytes(self, index: int) -> bytes | None:
         """See ``OpenScan``."""
         path = self.image_path[index]
+        if self._turn(index) != 1:
+            return None
         try:
-            return path.read_bytes()
+            return kept_bytes(path.read_bytes())
         except OSError as error:
             raise DataError(
                 f"cannot read the image {path} ({error.strerror}): copy or export it again"
@@ -64,11 +69,25 @@ class Scan(OpenScan):
     def read_color(self, index: int, image_size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
         """See ``OpenScan``."""
         path = self.image_path[index]
-        image = decode_image(path, name=str(path), image_size=image_size, stored=self.image_size)
+        image = decode_image(
+            path,
+            name=str(path),
+            image_size=image_size,
+            stored=self.image_size,
+            orientation=self._turn(index),
+            white=lambda: self._white,
+        )
         return image.permute(1, 2, 0).numpy()
 
     def close(self) -> None:
         """Do nothing: no file is open."""
+
+    @cached_property
+    def _white(self) -> int:
+        return white_level(self.image_path)
+
+    def _turn(self, index: int) -> int:
+        return 1 if self.tags is None else self.tags.turn(index)
 
 
 @dataclass(frozen=True, kw_only=True)
