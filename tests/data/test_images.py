@@ -353,9 +353,9 @@ def test_tags_say_what_is_up_and_which_of_them_nothing_decides() -> None:
     tags = OrientationTags((1, 3, 6, 8), (False, False, False, True))
     assert tags.sides == (0, 2, 3, 0)
     assert [tags.turn(n) for n in range(4)] == [1, 1, 1, 8]
-    assert tags.reversed((48, 64)).applied == (False, True, False, True)
-    assert tags.reversed((64, 64)).applied == (False, True, True, False)
-    assert OrientationTags((1, 6), (False, False)).reversed((48, 64)) is None
+    assert tags.reversed([(48, 64)] * 4).applied == (False, True, False, True)
+    assert tags.reversed([(64, 64)] * 4).applied == (False, True, True, False)
+    assert OrientationTags((1, 6), (False, False)).reversed([(48, 64)] * 2) is None
 
 
 def test_the_first_picture_of_an_animation_is_taken() -> None:

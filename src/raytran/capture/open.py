@@ -10,6 +10,7 @@ from pathlib import Path
 
 from raytran.capture.arkit import find_log, read_arkit
 from raytran.capture.colmap import find_model, read_colmap
+from raytran.capture.exif import with_tags_of_files
 from raytran.capture.nerfstudio import find_transforms, read_nerfstudio
 from raytran.capture.orientation import WorldSettings, to_our_world
 from raytran.capture.record3d import find_metadata, read_record3d
@@ -67,7 +68,8 @@ def open_scene(path: Path, *, format: str = "auto", settings: WorldSettings | No
     path = Path(path)
     name = _recognised(path) if format == "auto" else format
     if name == "scannet":
-        return to_our_world(open_scan(path), settings, aligned=True)
+        scan: OpenScan = with_tags_of_files(open_scan(path))
+        return to_our_world(scan, settings, up=(0.0, 0.0, 1.0))
     recording = _FORMATS[name].read(path)
     scan = _FORMATS[name].open(recording)
     try:

@@ -7,6 +7,7 @@ The layout is that of TUM RGB-D and of most SLAM programs. ARKit's logs and vide
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from raytran.capture.lens import Lens, check_lens, opencv_lens
 from raytran.capture.recording import Frame, Recording, frame_name, images_in, path_inside
-from raytran.data.images import stored_size
+from raytran.data.images import first_header
 from raytran.data.scan import NO_POSE
 from raytran.errors import DataError
 
@@ -155,18 +156,20 @@ def poses_at(track: Track, times: NDArray[np.float64]) -> NDArray[np.float64]:
     return poses
 
 
-def read_camera(path: Path, image_size: tuple[int, int]) -> Lens:
+def read_camera(path: Path, *sizes: tuple[int, int]) -> Lens:
     """Read intrinsics: a 3×3 or 4×4 matrix, or ``fx fy cx cy [k1 k2 p1 p2 [k3]]``.
 
     Args:
         path: the file.
-        image_size: ``(H, W)`` of the images that they are for.
+        sizes: ``(H, W)`` of the images that they are for; of several, as shown and as stored, the first in
+            whose middle the principal point lies best.
 
     Raises:
         ConfigError: the lens distorts and pycolmap is not installed.
         DataError: the file holds neither, or they are no lens of such images; see ``check_lens``.
     """
     values = read_table(path)
+    image_size = _nearest_size(values, sizes)
     if values.shape in ((3, 3), (4, 4)):
         focal, center = (values[0, 0], values[1, 1]), (values[0, 2], values[1, 2])
         return check_lens(Lens(image_size, focal, center), str(path))
@@ -178,6 +181,15 @@ def read_camera(path: Path, image_size: tuple[int, int]) -> Lens:
     fx, fy, cx, cy, *distortion = values.ravel().tolist()
     k1, k2, p1, p2, k3 = (*distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
     return opencv_lens(image_size, (fx, fy), (cx, cy), (k1, k2, k3, 0.0), (p1, p2), str(path))
+
+
+def _nearest_size(values: NDArray[np.float64], sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    """Return the size in whose middle the principal point of intrinsics lies best."""
+    is_matrix = values.shape in ((3, 3), (4, 4))
+    center = values[:2, 2] if is_matrix else values.ravel()[2:4]
+    if len(set(sizes)) == 1 or center.shape != (2,):
+        return sizes[0]
+    return min(sizes, key=lambda size: float(np.abs(center / np.array(size[::-1]) - 0.5).max()))
 
 
 def find_track(folder: Path) -> Path | None:
@@ -223,7 +235,8 @@ def read_tum(path: Path) -> Recording:
     images = _timed_images(path, track)
     if not images:
         raise DataError(f"{path} has no images: put them in its folder rgb or images")
-    lens = read_camera(find_intrinsics(path), stored_size([image for image, _ in images]))
+    header = first_header([image for image, _ in images])
+    lens = read_camera(find_intrinsics(path), header.shown_size, header.size)
     poses = poses_at(track, np.array([time for _, time in images]))
     has_pose = [bool(np.isfinite(pose).all()) for pose in poses]
     if not any(has_pose):
@@ -242,6 +255,7 @@ def read_tum(path: Path) -> Recording:
             if known
         ),
         dropped={name: NO_POSE for name, known in zip(names, has_pose, strict=True) if not known},
+        honours_exif=True,
     )
 
 

@@ -152,9 +152,12 @@ class OrientationTags:
             for tag, applied in zip(self.orientation, self.applied, strict=True)
         )
 
-    def reversed(self, size: tuple[int, int]) -> OrientationTags | None:
+    def reversed(self, sizes: Sequence[tuple[int, int]]) -> OrientationTags | None:
         """Return the tags with images read the other way whose size ``(H, W)`` stays the same, or None."""
-        is_open = [tag != 1 and (tag < 5 or size[0] == size[1]) for tag in self.orientation]
+        is_open = [
+            tag != 1 and (tag < 5 or height == width)
+            for tag, (height, width) in zip(self.orientation, sizes, strict=True)
+        ]
         applied = tuple(a != o for a, o in zip(self.applied, is_open, strict=True))
         return OrientationTags(self.orientation, applied) if any(is_open) else None
 
