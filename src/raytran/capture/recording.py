@@ -228,7 +228,7 @@ def open_recording(recording: Recording) -> RecordedScan:
             header = read_header(frame.image)
         except DataError:
             return UNREADABLE
-        is_turned = _is_for_shown(frame.lens.size, header, default=recording.honours_exif)
+        is_turned = is_for_shown(frame.lens.size, header, default=recording.honours_exif)
         turns[frame.image] = header.orientation, is_turned
         return header.shown_size if is_turned else header.size
 
@@ -241,7 +241,7 @@ def open_recording(recording: Recording) -> RecordedScan:
     return build_scan(recording, size_of, open_images)
 
 
-def _is_for_shown(size: tuple[int, int], header: ImageHeader, *, default: bool) -> bool:
+def is_for_shown(size: tuple[int, int], header: ImageHeader, *, default: bool) -> bool:
     """Whether intrinsics for ``size`` (H, W) are for the image turned by its EXIF orientation.
 
     Where the aspect does not tell, the format's default does.
