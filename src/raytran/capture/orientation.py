@@ -75,6 +75,9 @@ their side: they do not all look straight up or down."""
 _TURNED_FAR = 0.2
 """Spread of the level columns from which cameras lie on their side and look about; nodding has less."""
 
+_NODDED = 0.1
+"""The same below which level rows may be from nodding, of images that lie on their side by what files say."""
+
 _LOOKS_DOWN = 0.08
 """Mean of cos(angle between where cameras look and the axis of up) from which they look down and not up."""
 
@@ -84,6 +87,8 @@ _FAR_ACROSS, _LEVEL_WALK = 0.2, 0.4
 _MIXED_CAMERAS = 40
 _MIXED_TILT = 0.01
 """Mean square of the tilt of level cameras of which some lie on their side; 0.1 rad in the mean."""
+_FEWEST_MIXED = 0.15
+"""Least share of those that lie on their side, and of the others; fewer do not hide which way is up."""
 
 _NEARLY_SIDEWAYS = 0.2
 """Cosine between +z and the tops of cameras which look one way from which they may look steeply down."""
@@ -206,12 +211,17 @@ def measured_up(
         plain = _level_axis(world_from_camera[:, :3, 0], world_from_camera[:, :3, 1])
         if rows is not None and not (plain and plain.spread < rows.spread and plain.reach > rows.reach):
             return MeasuredUp(_towards(rows.direction, -hinted[:, :3, 1].mean(axis=0)), is_level=True)
-        if plain is None or plain.turn < _TURNED_FAR:
+        if plain is None or plain.turn < _NODDED or plain.reach < _LEAST_REACH:
             return _mean_top(hinted)
         # A program that turned the pixels has left the tags: the images are level as they are.
     right, down, forward = (world_from_camera[:, :3, axis] for axis in range(3))
-    axis, lies = _axis_of_up(world_from_camera)
-    if axis is not None:
+    level, lies = _axis_of_up(world_from_camera)
+    if level is None or lies:
+        mixed = _mixed_axis(right, down, math.inf if level is None else level.spread * level.turn)
+        if mixed is not None:
+            return MeasuredUp(mixed, is_level=True)
+    if level is not None:
+        axis = level.direction
         upper_side = (-right if lies else -down).mean(axis=0)
         if tops_tell and not lies:
             return MeasuredUp(_towards(axis, upper_side), is_level=True)
@@ -219,9 +229,6 @@ def measured_up(
         looks_down = abs(float(axis @ forward.mean(axis=0))) > _LOOKS_DOWN
         direction = -forward.mean(axis=0) if looks_down else upper_side
         return MeasuredUp(_towards(axis, direction), is_level=True, is_side_known=False)
-    mixed = _mixed_axis(right, down)
-    if mixed is not None:
-        return MeasuredUp(mixed, is_level=True)
     return _mean_top(world_from_camera)
 
 
@@ -232,22 +239,20 @@ def _mean_top(world_from_camera: NDArray[np.float64]) -> MeasuredUp | None:
     return MeasuredUp(mean / length, is_level=False) if length > 0.5 else None
 
 
-def _axis_of_up(world_from_camera: NDArray[np.float64]) -> tuple[NDArray[np.float64] | None, bool]:
-    """Return the axis of up, with either sign, of level cameras; and whether they lie on their side."""
+def _axis_of_up(world_from_camera: NDArray[np.float64]) -> tuple[_LevelAxis | None, bool]:
+    """Return the axis of up of level cameras, and whether they lie on their side."""
     right, down = world_from_camera[:, :3, 0], world_from_camera[:, :3, 1]
     rows, columns = _level_axis(right, down), _level_axis(down, right)
     if rows is not None and columns is not None and rows.reach < _LEAST_REACH:
         rows = None
     if columns is None or columns.reach < _LEAST_REACH:
-        return (None if rows is None else rows.direction), False
+        return rows, False
     if rows is not None:
         lies = columns.spread < 0.2 * rows.spread and rows.spread > 0.05
     else:
         # Cameras that look one way and nod have level columns too; but people walk on a floor.
         lies = columns.turn > _TURNED_FAR or _walks_across(world_from_camera, columns.direction)
-    if lies:
-        return columns.direction, True
-    return (None if rows is None else rows.direction), False
+    return (columns, True) if lies else (rows, False)
 
 
 def _level_axis(level: NDArray[np.float64], other: NDArray[np.float64]) -> _LevelAxis | None:
@@ -269,11 +274,18 @@ def _walks_across(world_from_camera: NDArray[np.float64], axis: NDArray[np.float
     return bool(is_far and along_axis.std() < _LEVEL_WALK * along_columns.std())
 
 
-def _mixed_axis(right: NDArray[np.float64], down: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def _mixed_axis(
+    right: NDArray[np.float64], down: NDArray[np.float64], tilt: float
+) -> NDArray[np.float64] | None:
     """Return up of cameras of which some are upright and others on their side; None if it cannot be told.
 
     Of the directions at right angles to an axis of each of two cameras, that one is taken to which a row or a
     column of all cameras is nearest to a right angle.
+
+    Args:
+        right: ``(n, 3)`` direction of the rows of each image.
+        down: ``(n, 3)`` direction of its columns.
+        tilt: mean square of the tilt if all lie on their side, which must be clearly more than if some do.
     """
     if len(right) < _FEW_FRAMES:
         return None
@@ -292,7 +304,8 @@ def _mixed_axis(right: NDArray[np.float64], down: NDArray[np.float64]) -> NDArra
     is_upright = rows[:, best] < columns[:, best]
     level = np.where(is_upright[:, None], right, down)
     turn = np.linalg.eigvalsh(level.T @ level / len(level))[1]
-    if error[best] > _MIXED_TILT or turn < 0.05 or not is_upright.any():
+    is_mixed = _FEWEST_MIXED < is_upright.mean() < 1 - _FEWEST_MIXED
+    if not is_mixed or turn < 0.05 or error[best] > min(_MIXED_TILT, 0.25 * tilt):
         return None
     return _towards(candidates[best], -down[is_upright].mean(axis=0))
 

@@ -57,7 +57,7 @@ _ORIENTATIONS = {
     **{(1, 0, 0, 1): 1, (-1, 0, 0, 1): 2, (-1, 0, 0, -1): 3, (1, 0, 0, -1): 4},
     **{(0, 1, 1, 0): 5, (0, 1, -1, 0): 6, (0, -1, -1, 0): 7, (0, -1, 1, 0): 8},
 }
-"""Where a display matrix takes the axes of the picture (ISO 14496-12, §8.3.2) → the EXIF orientation that does."""
+"""Where a display matrix (ISO 14496-12, §8.3.2) takes the picture's axes → the EXIF orientation that does."""
 
 
 class VideoFile:
@@ -145,7 +145,7 @@ class VideoFile:
         ):  # damaged frames are told when they are read
             return 1
         largest = max(abs(value) for value in (a, b, c, d)) or 1
-        return _ORIENTATIONS.get(tuple(round(value / largest) for value in (a, b, c, d)), 1)  # type: ignore[arg-type]
+        return _ORIENTATIONS.get(tuple(round(value / largest) for value in (a, b, c, d)), 1)
 
     def _first_stream(self) -> Any:
         if not self._container.streams.video:
@@ -220,8 +220,8 @@ def read_video(path: Path) -> Recording:
     """Read the poses of a video's frames.
 
     Beside ``walk.mp4`` lie its poses, ``walk.txt`` or ``trajectory.txt``, and ``walk.intrinsics.txt`` or
-    ``intrinsics.txt``. Times are seconds since the first frame; poses without times are one per frame. Intrinsics
-    are for the frames as they are displayed, or as they are coded if their principal point says so.
+    ``intrinsics.txt``. Times are seconds since the first frame; poses without times are one per frame.
+    Intrinsics are for frames as they are displayed, or as they are coded if their principal point says so.
 
     Raises:
         DataError: a part is missing or damaged, or poses and frames are of other numbers or times.
@@ -288,8 +288,8 @@ def _poses(track: Track, times: NDArray[np.float64], video: Path) -> NDArray[np.
     numbers = _numbers_of_poses(track.times, times)
     if numbers is not None:
         _log.warning(
-            "%s: its frames come at another or a variable rate than the poses in %s, %d of them for %d frames: poses "
-            "are matched to frames by number",
+            "%s: its frames come at another or a variable rate than the poses in %s, %d for %d frames: they "
+            "are matched by number",
             video.stem,
             track.path.name,
             len(track),
@@ -312,8 +312,8 @@ def _numbers_of_poses(
 ) -> NDArray[np.int64] | None:
     """Return the number of the frame that each pose is of, if its time is that number over a constant rate.
 
-    Programs that were given the frames one by one know their numbers alone and write them as n / fps. In a video
-    of variable rate, or of another one than they were told, the frame was not shown at that time.
+    Programs that were given the frames one by one know their numbers alone and write them as n / fps. In a
+    video of variable rate, or of another one than they were told, the frame was not shown at that time.
 
     Args:
         pose_times: ``(m,)`` seconds, rising.
@@ -322,7 +322,7 @@ def _numbers_of_poses(
     Returns:
         None if poses have times of their own, or it makes no difference.
     """
-    if min(len(pose_times), len(times)) < 3:
+    if min(len(pose_times), len(times)) < 3 or not np.isfinite(pose_times).all():
         return None
     steps, pose_steps = np.diff(times), np.diff(pose_times)
     interval = float(pose_steps.min())
@@ -340,7 +340,8 @@ def _numbers_of_poses(
     if len(pose_times) == len(times):
         return numbers
     is_variable = (np.abs(steps / np.median(steps) - 1) > _UNEVEN).any()
-    nearest = np.abs(pose_times[:, None] - times[None]).min(axis=1)
+    after = np.searchsorted(times, pose_times).clip(1, len(times) - 1)
+    nearest = np.minimum(np.abs(times[after] - pose_times), np.abs(times[after - 1] - pose_times))
     return numbers if is_variable and (nearest > _AT_FRAME).mean() > 0.5 else None
 
 
