@@ -53,6 +53,9 @@ _WITH_VALUE = {
 }
 """Hydra's options that a word of their own may follow."""
 
+_NUMBERS = re.compile(r"(up|intrinsics)=\s*([-+.\deE]+(?:\s*,\s*[-+.\deE]+)+)\s*")
+"""Settings whose value may be several numbers, as typed."""
+
 _TYPED_FULL_ERROR = os.environ.get(_FULL_ERROR)
 
 
@@ -88,6 +91,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
 def _compose_or_exit(command: Callable[[], Any], typed: str | None) -> Any:
     """Run a command; a setting that does not exist becomes a sentence instead of Hydra's paragraph."""
     _set_full_error("1")  # Hydra then raises instead of printing; the task restores what the user has set
+    sys.argv[1:] = with_number_lists(sys.argv[1:])
     try:
         return command()
     except ConfigCompositionException as error:
@@ -189,6 +193,15 @@ def quoted(path: Path) -> str:
     """Return a path as Hydra's override grammar wants it."""
     escaped = str(path).replace("\\", "\\\\").replace('"', '\\"')
     return f'"{escaped}"'
+
+
+def with_number_lists(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line with ``up=1,2,3``, which is one value, as ``up=[1,2,3]``.
+
+    To Hydra commas are those of a sweep.
+    """
+    typed = ((word, _NUMBERS.fullmatch(word)) for word in words)
+    return [word if match is None else f"{match[1]}=[{match[2]}]" for word, match in typed]
 
 
 def name_positional(words: Sequence[str], key: str) -> list[str]:
