@@ -628,6 +628,19 @@ def test_a_world_that_is_promised_is_kept_and_its_pictures_are_turned(
     assert "up" not in caplog.text
 
 
+@pytest.mark.parametrize("side", [1, 2, 3])
+def test_scannets_form_may_have_intrinsics_of_shown_pictures(tmp_path, side):
+    poses = level_walk()
+    walk = stored_walk(tmp_path / "walk", poses, side)
+    shown = replace(walk, camera=(50.0, 51.0, 31.0, 25.0), image_size=(48, 64))
+    folder = write_scannet(shown, tmp_path / "scan", poses)
+    with open_scene(folder, settings=BLIND) as scan:
+        same_scan(scan, poses)
+    folder = write_scannet(walk, tmp_path / "stored")
+    with open_scene(folder, settings=BLIND) as scan:
+        same_scan(scan, poses)
+
+
 def test_a_world_that_contradicts_its_promise_is_reported_and_mended_by_a_setting(tmp_path, caplog):
     poses = level_walk()
     y_up = poses.copy()

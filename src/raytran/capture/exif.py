@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from raytran.capture.recording import RecordedScan
-from raytran.data.images import OrientationTags, read_header
+from raytran.data.images import OrientationTags, orientation_tags
 from raytran.data.scan import OpenScan
 from raytran.data.scannet.scan import Scan
-from raytran.errors import DataError
 
 _LOOKED_AT = 8
 """Images of a scan in ScanNet's forms in which a tag is sought; its own never have one."""
@@ -53,19 +52,10 @@ def with_tags_of_files(scan: OpenScan) -> OpenScan:
         return scan
     count = len(scan)
     some = np.unique(np.linspace(0, count - 1, min(count, _LOOKED_AT)).round().astype(int)).tolist()
-    if all(_orientation(scan, index) == 1 for index in some):
+    if not any(orientation_tags([scan.image_path[index] for index in some], applied=True).applied):
         return scan
-    orientation = tuple(_orientation(scan, index) for index in range(count))
-    height, width = scan.image_size
-    applied = tuple(tag != 1 and (tag < 5 or height == width) for tag in orientation)
-    return replace(scan, tags=OrientationTags(orientation, applied))
-
-
-def _orientation(scan: Scan, index: int) -> int:
-    try:
-        return read_header(scan.image_path[index]).orientation
-    except DataError:  # it is replaced by its neighbour when it is read
-        return 1
+    tags = orientation_tags(scan.image_path, applied=False)
+    return replace(scan, tags=tags.reversed([scan.image_size] * count) or tags)
 
 
 def read_the_other_way(scan: OpenScan) -> OpenScan | None:

@@ -162,6 +162,22 @@ class OrientationTags:
         return OrientationTags(self.orientation, applied) if any(is_open) else None
 
 
+def orientation_tags(paths: Sequence[Path], *, applied: bool) -> OrientationTags:
+    """Return the tags of images; one that cannot be read has none.
+
+    Args:
+        paths: their files.
+        applied: whether those with a tag are turned by it.
+    """
+    orientation = []
+    for path in paths:
+        try:
+            orientation.append(_header(path).orientation)
+        except (*UNREADABLE, DataError):  # it is replaced by its neighbour when it is read
+            orientation.append(1)
+    return OrientationTags(tuple(orientation), tuple(applied and tag != 1 for tag in orientation))
+
+
 def turned_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:
     """Return ``(H, W)`` of an image of ``size`` after it was turned by an EXIF orientation."""
     return (size[1], size[0]) if orientation >= 5 else size

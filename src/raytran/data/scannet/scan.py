@@ -12,7 +12,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from raytran.data.images import OrientationTags, decode_image, kept_bytes, stored_size, white_level
+from raytran.data.images import (
+    OrientationTags,
+    decode_image,
+    first_header,
+    kept_bytes,
+    orientation_tags,
+    white_level,
+)
 from raytran.data.scan import LOST, NO_IMAGE, NO_POSE, OpenScan, even_views, numbers_first
 from raytran.data.scannet.layout import Listing, find_layout, recognise
 from raytran.data.scannet.sens import SensFile
@@ -20,6 +27,7 @@ from raytran.data.scannet.text import (
     are_rigid,
     axis_alignment,
     check_intrinsics,
+    fits_better,
     read_header,
     read_intrinsics,
     read_matrix,
@@ -153,16 +161,23 @@ def read_scan(folder: Path, *, header: Path | None = None, any_size: bool = Fals
         )
     header = header or folder / f"{folder.name}.txt"
     facts = read_header(header)
-    image_size = stored_size([images[name] for name in names])
+    paths = tuple(images[name] for name in names)
     intrinsics_file = layout.intrinsics()
+    matrix = read_intrinsics(intrinsics_file)
+    shown = first_header(paths)
+    image_size, tags = shown.size, None
+    if fits_better(matrix, shown.shown_size, shown.size):
+        # Of pictures on their side, the intrinsics are for those that an EXIF orientation turns upright.
+        image_size, tags = shown.shown_size, orientation_tags(paths, applied=True)
     return Scan(
         scene_id=folder.name,
         folder=folder,
         frame_id=tuple(names),
-        image_path=tuple(images[name] for name in names),
+        image_path=paths,
+        tags=tags,
         world_from_camera=torch.from_numpy(poses[rigid]),
         intrinsics=check_intrinsics(
-            read_intrinsics(intrinsics_file),
+            matrix,
             intrinsics_file,
             image_size=image_size,
             header=facts,

@@ -128,6 +128,12 @@ def check_intrinsics(
     return torch.from_numpy(matrix[:3, :3].copy())
 
 
+def fits_better(matrix: NDArray[np.float64], size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether a camera matrix has its principal point nearer to the middle of one size (H, W) than another's."""
+    near, far = (_distance_from_centre(matrix, width, height) for height, width in (size, other))
+    return size != other and near < far
+
+
 def _start_of(path: Path) -> bytes:
     with path.open("rb") as file:
         return file.read(_MAX_BYTES)
