@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from raytran.data.images import open_image
+from raytran.data.images import decode_image
 from raytran.errors import DataError
 from raytran.export import read_scene_json
 from raytran.geometry.camera import Cameras
@@ -316,8 +316,7 @@ def _read_mesh(path: Path) -> trimesh.Trimesh | None:
 
 
 def _image(content: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    with open_image(content.tobytes()) as image:
-        return np.asarray(image.convert("RGB"))
+    return decode_image(content.tobytes(), name=f"of a frame in {FILE}").permute(1, 2, 0).numpy()
 
 
 def _truth(arrays: Mapping[str, NDArray[Any]]) -> ObjectSet:

@@ -129,7 +129,7 @@ def check_intrinsics(
 
 
 def fits_better(matrix: NDArray[np.float64], size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether a camera matrix has its principal point nearer to the middle of one size (H, W) than another's."""
+    """Whether a camera matrix has its principal point nearer to the middle of one size than of another."""
     near, far = (_distance_from_centre(matrix, width, height) for height, width in (size, other))
     return size != other and near < far
 
