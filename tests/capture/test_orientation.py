@@ -666,6 +666,19 @@ def test_a_leaning_world_that_contradicts_its_promise_names_a_vector_that_mends_
         same_scan(scan, poses, tolerance=1)
 
 
+@pytest.mark.parametrize(("down_deg", "turn_deg"), [(20, 10), (45, 10), (45, 0)])
+def test_a_track_whose_cameras_look_one_way_and_down_keeps_its_level_world(
+    tmp_path, caplog, down_deg, turn_deg
+):
+    poses = level_walk(down_deg=down_deg, turn_deg=turn_deg)
+    walk = replace(stored_walk(tmp_path / "walk", poses, 0, with_tags=False), poses=poses)
+    write_tum(walk, tmp_path / "tum", np.arange(24) / 10)
+    caplog.set_level("INFO")
+    with open_scene(tmp_path / "tum", settings=BLIND) as scan:
+        np.testing.assert_allclose(scan.world_from_camera.numpy(), poses, atol=1e-6)
+    assert "up is +z (measured from the cameras, unsure, for they look one way)" in caplog.text
+
+
 @pytest.mark.parametrize("side", [1, 3])
 def test_record3d_in_landscape_comes_upright(tmp_path, side):
     """Before version 1.10 it stored all in portrait, in the world of the first camera."""
@@ -686,7 +699,7 @@ def test_record3d_in_landscape_comes_upright(tmp_path, side):
         same_scan(scan, poses, tolerance=2)
 
 
-@pytest.mark.parametrize("given", ["list", "text", "brackets", "long", "tuple"])
+@pytest.mark.parametrize("given", ["list", "text", "brackets", "long", "tuple", "array"])
 def test_up_may_be_any_direction(tmp_path, given, caplog):
     poses = level_walk()
     leaning, up = elsewhere(lying(poses, 1))
@@ -695,6 +708,7 @@ def test_up_may_be_any_direction(tmp_path, given, caplog):
     x, y, z = up.tolist()
     forms = {"list": [x, y, z], "text": f"{x},{y},{z}", "brackets": f"[{x}, {y}, {z}]", "tuple": (x, y, z)}
     forms["long"] = [1e300 * x, 1e300 * y, 1e300 * z]
+    forms["array"] = up
     with open_scene(walk.folder, settings=replace(BLIND, up=forms[given])) as scan:
         same_scan(scan, poses)
     assert "(as up= says)" in caplog.text
@@ -725,22 +739,18 @@ def turned_in_files(scan, folder, turn, *, with_tags):
     return folder
 
 
-def test_the_images_tell_whether_poses_are_of_shown_or_of_stored_pictures(furnished, tmp_path, caplog):
+@pytest.mark.parametrize(("side", "how"), [(0, "shown"), (2, "stored")])
+def test_the_images_tell_whether_poses_are_of_shown_or_of_stored_pictures(
+    furnished, tmp_path, caplog, side, how
+):
+    """The same pictures with the poses of a program that honours their tag, and of one that does not know it."""
     caplog.set_level("INFO")
     poses = furnished.world_from_camera.double().numpy()
-    shown = turned_in_files(furnished, tmp_path / "shown", 3, with_tags=True)
-    with open_scene(shown) as scan:
+    tracked = replace(furnished, world_from_camera=torch.from_numpy(lying(poses, side)))
+    with open_scene(turned_in_files(tracked, tmp_path / "tum", 3, with_tags=True)) as scan:
         np.testing.assert_allclose(scan.world_from_camera, poses, atol=1e-6)
         np.testing.assert_array_equal(scan.read_color(3), furnished.read_color(3))
-    assert "those of the images as shown, as the images agree with the poses" in caplog.text
-    caplog.clear()
-    # The same pictures with the poses of a program that does not know of the tag.
-    stored = replace(furnished, world_from_camera=torch.from_numpy(lying(poses, 2)))
-    folder = turned_in_files(stored, tmp_path / "stored", 3, with_tags=True)
-    with open_scene(folder) as scan:
-        np.testing.assert_allclose(scan.world_from_camera, poses, atol=1e-6)
-        np.testing.assert_array_equal(scan.read_color(3), furnished.read_color(3))
-    assert "those of the images as stored, as the images agree with the poses" in caplog.text
+    assert f"those of the images as {how}, as the images agree with the poses" in caplog.text
     assert "camera axes" not in caplog.text
 
 

@@ -73,7 +73,14 @@ def open_scene(path: Path, *, format: str = "auto", settings: WorldSettings | No
     recording = _FORMATS[name].read(path)
     scan = _FORMATS[name].open(recording)
     try:
-        return to_our_world(scan, settings, axes=recording.axes, up=recording.up, metric=recording.metric)
+        return to_our_world(
+            scan,
+            settings,
+            axes=recording.axes,
+            up=recording.up,
+            metric=recording.metric,
+            aligned=recording.aligned,
+        )
     except BaseException:
         scan.close()
         raise

@@ -45,6 +45,9 @@ _TILTED_DEG, _WRONG_DEG = 12.0, 35.0
 """Angles between up and an axis of the world: below the first it is the axis for certain, below the second it
 is if the cameras look one way, which tilts what they tell of up."""
 
+_STEEP_DEG = 65.0
+"""Angle between +z and the tops of cameras that look one way within which +z may be up."""
+
 _OFF_AXIS_DEG = 15.0
 """Angle from another axis within which the doctor calls a wrong up by the name of that axis."""
 
@@ -115,8 +118,7 @@ class WorldSettings:
     check: bool = True
 
     def __post_init__(self) -> None:
-        if self.up != "auto":
-            _direction(self.up)
+        _direction(self.up)
         if self.convention not in CONVENTIONS:
             raise ConfigError(f"unknown convention={self.convention}: choose one of {', '.join(CONVENTIONS)}")
         if self.scale is not None and not (math.isfinite(self.scale) and self.scale > 0):
@@ -125,15 +127,17 @@ class WorldSettings:
     @property
     def direction(self) -> NDArray[np.float64] | None:
         """``(3,)`` direction of up, of length one; None: the format or the cameras tell it."""
-        return None if self.up == "auto" else _direction(self.up)
+        return _direction(self.up)
 
 
-def _direction(up: object) -> NDArray[np.float64]:
-    """Return the unit vector that ``up=`` asks for.
+def _direction(up: object) -> NDArray[np.float64] | None:
+    """Return the unit vector that ``up=`` asks for; None for ``auto``.
 
     Raises:
         ConfigError: it is none.
     """
+    if isinstance(up, str) and up == "auto":
+        return None
     if isinstance(up, str) and up in UPS[1:]:
         return (-1.0 if up[0] == "-" else 1.0) * np.eye(3)["xyz".index(up[1])]
     shown = str(up)[:60]
@@ -431,6 +435,7 @@ def to_our_world(
     axes: Axes = "opencv",
     up: tuple[float, float, float] | None = None,
     metric: bool = True,
+    aligned: bool = False,
 ) -> OpenScan:
     """Return the scan in OpenCV axes, metres and a world whose +z is up; what was decided is logged.
 
@@ -444,6 +449,7 @@ def to_our_world(
         axes: camera axes of the format.
         up: direction of up that the format promises, or None.
         metric: whether the format promises metres.
+        aligned: whether its worlds mostly have an axis that is up.
     """
     convention = axes if settings.convention == "auto" else settings.convention
     if convention == "opengl":
@@ -466,7 +472,7 @@ def to_our_world(
         scan, distance, tops_tell = _with_checked_cameras(scan, matches, settings, convention)
     else:
         scan = _read_as_up_agrees(scan, known)
-    scan = _with_z_up(scan, settings.direction, up, tops_tell)
+    scan = _with_z_up(scan, settings.direction, up, tops_tell=tops_tell, aligned=aligned)
     _check_scale(scan, settings, metric, distance)
     return scan
 
@@ -570,7 +576,9 @@ def _with_z_up(
     scan: OpenScan,
     asked: NDArray[np.float64] | None,
     promised: tuple[float, float, float] | None,
+    *,
     tops_tell: bool,
+    aligned: bool,
 ) -> OpenScan:
     """Return the scan in a world whose +z is up, with images turned that lie on their side or head.
 
@@ -592,10 +600,7 @@ def _with_z_up(
         )
         return scan
     else:
-        tolerance = _TILTED_DEG if measured.is_level else _WRONG_DEG
-        axis = _nearest_axis(measured.direction)
-        is_axis = measured.direction @ axis > math.cos(math.radians(tolerance))
-        up = axis if is_axis else measured.direction
+        up = _likely_up(measured, aligned)
         how = f"measured from the cameras, {_certainty(measured)}"
     log = _log.info if up[2] == 1.0 else _log.warning
     log("%s: up is %s (%s); up= would override it", scan.scene_id, _axis_name(up), how)
@@ -603,6 +608,19 @@ def _with_z_up(
     if upright is not scan:
         _log.info("%s: images are stored sideways or on their heads and get turned", scan.scene_id)
     return upright if up[2] == 1.0 else _transformed(upright, world_rotation=rotation_to_z(up))
+
+
+def _likely_up(measured: MeasuredUp, aligned: bool) -> NDArray[np.float64]:
+    """Return the measured direction, or the axis of the world that it is likely to mean."""
+    axis = _nearest_axis(measured.direction)
+    tolerance = _TILTED_DEG if measured.is_level else _WRONG_DEG
+    if measured.direction @ axis > math.cos(math.radians(tolerance)):
+        return axis
+    if measured.is_level or not aligned:
+        return measured.direction
+    # Cameras that look one way and steeply down tell nothing against a world that is level.
+    looks_down = measured.direction[2] > math.cos(math.radians(_STEEP_DEG))
+    return np.array([0.0, 0.0, 1.0]) if looks_down else axis
 
 
 def _certainty(measured: MeasuredUp) -> str:

@@ -75,6 +75,7 @@ class Recording:
         axes: camera axes of the poses.
         up: direction of up in the world, ``(3,)``, if the format promises one.
         metric: whether the format promises metres.
+        aligned: whether its worlds mostly have an axis that is up.
         honours_exif: whether its programs turn images by their EXIF orientation before they work on them.
         dropped: reason for each image without a pose and each pose without an image.
     """
@@ -85,6 +86,7 @@ class Recording:
     axes: Axes = "opencv"
     up: tuple[float, float, float] | None = None
     metric: bool = False
+    aligned: bool = False
     honours_exif: bool = False
     dropped: dict[str, str] = field(default_factory=dict)
 

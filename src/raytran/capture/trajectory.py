@@ -255,6 +255,7 @@ def read_tum(path: Path) -> Recording:
             if known
         ),
         dropped={name: NO_POSE for name, known in zip(names, has_pose, strict=True) if not known},
+        aligned=True,
         honours_exif=True,
     )
 

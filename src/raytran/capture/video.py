@@ -244,6 +244,7 @@ def read_video(path: Path) -> Recording:
         scene_id=video.stem,
         frames=tuple(Frame(str(n), video, poses[n], lens, n) for n, known in enumerate(has_pose) if known),
         dropped={str(n): NO_POSE for n, known in enumerate(has_pose) if not known},
+        aligned=True,
         honours_exif=True,
     )
 
