@@ -479,11 +479,11 @@ def to_our_world(
 
 def _read_as_images_agree(scan: OpenScan, up: NDArray[np.float64] | None) -> tuple[OpenScan, Matches]:
     """Return the scan with its images read as shown or stored, as they agree with the poses; and matches."""
-    matches = match_frames(partial(read_grey, scan), len(scan))
+    matches = _matches(scan)
     other = read_the_other_way(scan)
     if other is None:
         return _read_as_up_agrees(scan, up), matches
-    matches_of_other = match_frames(partial(read_grey, other), len(other))
+    matches_of_other = _matches(other)
     share = agreement(RawScan.of(scan), matches)
     share_of_other = agreement(RawScan.of(other), matches_of_other)
     if is_clearly_better(share_of_other, share):
@@ -494,6 +494,10 @@ def _read_as_images_agree(scan: OpenScan, up: NDArray[np.float64] | None) -> tup
         return scan, matches
     read = _read_as_up_agrees(scan, up)
     return read, matches if tags_of(read) == tags_of(scan) else matches_of_other
+
+
+def _matches(scan: OpenScan) -> Matches:
+    return match_frames(partial(read_grey, scan), len(scan))
 
 
 def _read_as_up_agrees(scan: OpenScan, up: NDArray[np.float64] | None) -> OpenScan:
