@@ -11,7 +11,7 @@ from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 
 from raytran.errors import DataError
-from raytran.run.entry import compose, name_positional, run_or_exit
+from raytran.run.entry import compose, name_positional, run_or_exit, with_number_lists
 
 
 def raise_error(error):
@@ -114,3 +114,24 @@ def test_compose_is_what_the_command_line_would_compose():
 )
 def test_words_without_a_key_get_one(typed, meant):
     assert name_positional(typed, "file") == meant
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        ("up=0.1,0.2,0.97", "up=[0.1,0.2,0.97]"),
+        ("up=-1e-3, +2, .5", "up=[-1e-3, +2, .5]"),
+        ("intrinsics=500,501.5,320,240", "intrinsics=[500,501.5,320,240]"),
+        *(
+            (same, same)
+            for same in ("up=+y", "up=-z,+y", "up=[0,0,1]", "up=auto", "num_views=4,8", "seed=1,2")
+        ),
+    ],
+)
+def test_numbers_that_are_one_value_are_no_sweep(typed, meant):
+    assert with_number_lists(["scene=a,b", typed]) == ["scene=a,b", meant]
+
+
+def test_a_direction_as_typed_reaches_the_command():
+    cfg = compose("predict", ["scene=a", "output=b", *with_number_lists(["up=0.1,-0.2,+1"])])
+    assert list(cfg.up) == [0.1, -0.2, 1]

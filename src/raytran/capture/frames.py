@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
+from raytran.data.images import UNREADABLE, open_image
 from raytran.data.scan import OpenScan
 from raytran.data.scannet.scan import Scan, SensScan
 from raytran.errors import DataError
@@ -19,6 +20,8 @@ from raytran.limits import MAX_SIDE
 
 _DEPTH_STEPS = 1000.0
 """Steps of ScanNet's exported depth maps in a metre."""
+
+_DEPTH_KINDS = ("PNG", "PPM")
 
 _BLUR_WIDTH = 240
 """Columns of the images whose sharpness is measured: a network whose cells are 16 pixels wide sees no finer
@@ -67,12 +70,12 @@ class RawScan:
             path = _depth_path(self.scan, frame)
             if path is None:
                 return None
-            with Image.open(path) as image:
+            with open_image(path, kinds=_DEPTH_KINDS) as image:
                 if max(image.size) > MAX_SIDE:
                     return None
                 depth = np.asarray(image, dtype=np.float64) / _DEPTH_STEPS
             return depth if depth.ndim == 2 else None
-        except (DataError, OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        except (DataError, *UNREADABLE):
             return None
 
     def frames_with_depth(self) -> list[int]:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from raytran.capture.arkit import find_log, read_arkit
 from raytran.capture.colmap import find_model, read_colmap
+from raytran.capture.exif import with_tags_of_files
 from raytran.capture.nerfstudio import find_transforms, read_nerfstudio
 from raytran.capture.orientation import WorldSettings, to_our_world
 from raytran.capture.packed import UnpackedScan, is_packed, unpack
@@ -89,11 +90,19 @@ def open_scene(
         return _open_packed(path, format, settings, intrinsics)
     name = _recognised(path) if format == "auto" else format
     if name == "scannet":
-        return to_our_world(open_scan(path, intrinsics), settings, aligned=_is_aligned(path))
+        scan: OpenScan = with_tags_of_files(open_scan(path, intrinsics))
+        return to_our_world(scan, settings, up=(0.0, 0.0, 1.0) if _is_aligned(path) else None)
     recording = _FORMATS[name].read(path, intrinsics)
     scan = _FORMATS[name].open(recording)
     try:
-        return to_our_world(scan, settings, axes=recording.axes, up=recording.up, metric=recording.metric)
+        return to_our_world(
+            scan,
+            settings,
+            axes=recording.axes,
+            up=recording.up,
+            metric=recording.metric,
+            aligned=recording.aligned,
+        )
     except BaseException:
         scan.close()
         raise

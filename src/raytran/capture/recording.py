@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,10 +29,21 @@ from raytran.capture.lens import (
     pinhole_of,
     resample,
 )
-from raytran.data.images import box_within, decode_image, fill_up, has_shape, is_turned, stored_size
-from raytran.data.scan import NO_IMAGE, OTHER_SHAPE, TURNED, OpenScan, none_usable, numbers_first
+from raytran.data.images import (
+    ImageHeader,
+    OrientationTags,
+    box_within,
+    decode_image,
+    fill_up,
+    has_shape,
+    is_turned,
+    kept_bytes,
+    read_header,
+    white_level,
+)
+from raytran.data.scan import NEEDS_HEIF, NO_IMAGE, OTHER_SHAPE, TURNED, OpenScan, none_usable, numbers_first
 from raytran.data.scannet.text import pose_faults
-from raytran.errors import DataError
+from raytran.errors import ConfigError, DataError
 from raytran.geometry.camera import is_off_center
 from raytran.limits import Quantity, as_number, as_numbers
 
@@ -79,6 +91,8 @@ class Recording:
         axes: camera axes of the poses.
         up: direction of up in the world, ``(3,)``, if the format promises one.
         metric: whether the format promises metres.
+        aligned: whether its worlds mostly have an axis that is up.
+        honours_exif: whether its programs turn images by their EXIF orientation before they work on them.
         dropped: reason for each image without a pose and each pose without an image.
     """
 
@@ -88,6 +102,8 @@ class Recording:
     axes: Axes = "opencv"
     up: tuple[float, float, float] | None = None
     metric: bool = False
+    aligned: bool = False
+    honours_exif: bool = False
     dropped: dict[str, str] = field(default_factory=dict)
 
 
@@ -127,6 +143,15 @@ class FrameList:
 class FrameImages(ABC):
     """The images of a recording's frames, read one by one."""
 
+    @property
+    def tags(self) -> OrientationTags | None:
+        """Which side of each is up by its file, if a file says that it is not the top."""
+        return None
+
+    def with_tags(self, tags: OrientationTags) -> FrameImages:
+        """Return the same images, turned as ``tags`` says when they are read."""
+        raise NotImplementedError
+
     @abstractmethod
     def read(
         self, index: int, image_size: tuple[int, int] | None, stored: tuple[int, int]
@@ -138,7 +163,7 @@ class FrameImages(ABC):
         """
 
     def encoded(self, index: int) -> bytes | None:
-        """Return the JPEG or PNG as stored, or None if it is none.
+        """Return the file's content, if that is a JPEG or PNG whose pixels are used as they are, else None.
 
         Raises:
             DataError: it cannot be read.
@@ -155,23 +180,49 @@ class ImageFiles(FrameImages):
     """Images in files of their own."""
 
     paths: tuple[Path, ...]
+    orientations: OrientationTags | None = None
+
+    @property
+    def tags(self) -> OrientationTags | None:
+        """See ``FrameImages``."""
+        return self.orientations
+
+    def with_tags(self, tags: OrientationTags) -> ImageFiles:
+        """See ``FrameImages``."""
+        return replace(self, orientations=tags)
 
     def read(
         self, index: int, image_size: tuple[int, int] | None, stored: tuple[int, int]
     ) -> NDArray[np.uint8]:
         """See ``FrameImages``."""
         path = self.paths[index]
-        image = decode_image(path, name=str(path), image_size=image_size, stored=stored)
+        image = decode_image(
+            path,
+            name=str(path),
+            image_size=image_size,
+            stored=stored,
+            orientation=self._turn(index),
+            white=lambda: self._white,
+        )
         return image.permute(1, 2, 0).numpy()
 
     def encoded(self, index: int) -> bytes | None:
         """See ``FrameImages``."""
+        if self._turn(index) != 1:
+            return None
         try:
-            return self.paths[index].read_bytes()
+            return kept_bytes(self.paths[index].read_bytes())
         except OSError as error:
             raise DataError(
                 f"cannot read the image {self.paths[index]} ({error.strerror}): copy or export it again"
             ) from error
+
+    @cached_property
+    def _white(self) -> int:
+        return white_level(self.paths)
+
+    def _turn(self, index: int) -> int:
+        return 1 if self.orientations is None else self.orientations.turn(index)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,16 +275,39 @@ def open_recording(recording: Recording) -> RecordedScan:
     Raises:
         DataError: see ``build_scan``.
     """
+    turns: dict[Path, tuple[int, bool]] = {}
 
     def size_of(frame: Frame) -> tuple[int, int] | str:
         if not frame.image.is_file():
             return NO_IMAGE
         try:
-            return stored_size([frame.image])
+            header = read_header(frame.image)
         except DataError:
             return UNREADABLE
+        except ConfigError:
+            return NEEDS_HEIF
+        as_shown = is_for_shown(frame.lens.size, header, default=recording.honours_exif)
+        turns[frame.image] = header.orientation, as_shown
+        return header.shown_size if as_shown else header.size
 
-    return build_scan(recording, size_of, lambda frames: ImageFiles(tuple(frame.image for frame in frames)))
+    def open_images(frames: list[Frame]) -> ImageFiles:
+        paths = tuple(frame.image for frame in frames)
+        orientation, applied = zip(*(turns[path] for path in paths), strict=True)
+        has_tags = any(tag != 1 for tag in orientation)
+        return ImageFiles(paths, OrientationTags(orientation, applied) if has_tags else None)
+
+    return build_scan(recording, size_of, open_images)
+
+
+def is_for_shown(size: tuple[int, int], header: ImageHeader, *, default: bool) -> bool:
+    """Whether intrinsics for ``size`` (H, W) are for the image turned by its EXIF orientation.
+
+    Where the aspect does not tell, the format's default does.
+    """
+    fits_shown, fits_stored = (
+        min(size) > 0 and has_shape(of_image, size) for of_image in (header.shown_size, header.size)
+    )
+    return header.orientation != 1 and (default if fits_shown == fits_stored else fits_shown)
 
 
 def build_scan(
@@ -375,14 +449,22 @@ def _camera_of(frame: Frame, listed_in: Path) -> str:
     return f"the camera of {frame.name} in {listed_in}"
 
 
-def typed_lens(intrinsics: Intrinsics, size: tuple[int, int]) -> Lens:
-    """Return the lens that a user typed for images of a stored size ``(H, W)``.
+def typed_lens(intrinsics: Intrinsics, *sizes: tuple[int, int]) -> Lens:
+    """Return the lens that a user typed for images of a stored size ``(H, W)``; of several, the nearest one.
 
     Raises:
         DataError: no lens of such images has such intrinsics.
     """
     fx, fy, cx, cy = intrinsics
+    size = nearest_size(np.array([cx, cy]), sizes)
     return check_lens(Lens(size, (fx, fy), (cx, cy)), f"intrinsics={fx:g},{fy:g},{cx:g},{cy:g}")
+
+
+def nearest_size(center: NDArray[np.float64], sizes: Sequence[tuple[int, int]]) -> tuple[int, int]:
+    """Return the first of some sizes ``(H, W)`` in whose middle a principal point (cx, cy) lies best."""
+    if len(set(sizes)) == 1 or center.shape != (2,):
+        return sizes[0]
+    return min(sizes, key=lambda size: float(np.abs(center / np.array(size[::-1]) - 0.5).max()))
 
 
 def number(

@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from raytran.capture.lens import Lens, check_lens, opencv_lens
 from raytran.capture.names import frame_name, images_in, locate, unlike
-from raytran.capture.recording import Frame, Intrinsics, Recording, number, typed_lens
-from raytran.data.images import stored_size
+from raytran.capture.recording import Frame, Intrinsics, Recording, nearest_size, number, typed_lens
+from raytran.data.images import most_frequent_header
 from raytran.data.scan import NO_POSE
 from raytran.data.text import parted, read_json_object, read_table, read_text
 from raytran.errors import DataError
@@ -238,12 +238,13 @@ def poses_at(track: Track, times: NDArray[np.float64]) -> NDArray[np.float64]:
     return poses
 
 
-def read_camera(path: Path, image_size: tuple[int, int]) -> Lens:
+def read_camera(path: Path, *sizes: tuple[int, int]) -> Lens:
     """Read intrinsics: a 3×3 or 4×4 matrix, or ``fx fy cx cy [k1 k2 p1 p2 [k3]]``.
 
     Args:
         path: the file; or Replica's ``cam_params.json``.
-        image_size: ``(H, W)`` of the images that they are for.
+        sizes: ``(H, W)`` of the images that they are for; of several, as shown and as stored, the first in
+            whose middle the principal point lies best.
 
     Raises:
         ConfigError: the lens distorts and pycolmap is not installed.
@@ -254,6 +255,8 @@ def read_camera(path: Path, image_size: tuple[int, int]) -> Lens:
     values = read_table(path)
     if not (np.abs(values) <= FOCAL_LENGTH.high).all():  # not-a-number is not
         raise DataError(f"{path} holds numbers that are no pixels: write `fx fy cx cy` of the stored images")
+    is_matrix = values.shape in ((3, 3), (4, 4))
+    image_size = nearest_size(values[:2, 2] if is_matrix else values.ravel()[2:4], sizes)
     if values.shape in ((3, 3), (4, 4)):
         focal, center = (values[0, 0], values[1, 1]), (values[0, 2], values[1, 2])
         return check_lens(Lens(image_size, focal, center), str(path))
@@ -304,26 +307,26 @@ def find_intrinsics(folder: Path) -> Path | None:
     return path
 
 
-def shared_lens(folder: Path, size: tuple[int, int], intrinsics: Intrinsics | None) -> Lens:
+def shared_lens(folder: Path, *sizes: tuple[int, int], intrinsics: Intrinsics | None) -> Lens:
     """Return the lens of all images of a folder: what the user typed, or else what a file says.
 
     Args:
         folder: of the pose track.
-        size: ``(H, W)`` of the stored images.
+        sizes: ``(H, W)`` of the images; see ``read_camera``.
         intrinsics: fx, fy, cx, cy that the user typed.
 
     Raises:
         ConfigError, DataError: see ``read_camera``; or there is no file.
     """
     if intrinsics is not None:
-        return typed_lens(intrinsics, size)
+        return typed_lens(intrinsics, *sizes)
     path = find_intrinsics(folder)
     if path is None:
         raise DataError(
             f"{folder} has no {INTRINSICS_NAMES[0]}: write `fx fy cx cy` of the stored images there, or give "
             "intrinsics=fx,fy,cx,cy"
         )
-    return read_camera(path, size)
+    return read_camera(path, *sizes)
 
 
 def is_tum(path: Path) -> bool:
@@ -349,8 +352,8 @@ def read_tum(path: Path, intrinsics: Intrinsics | None = None) -> Recording:
     if not posed:
         raise DataError(f"{path} has no images: put them in its folder rgb or images")
     images = [image for image, _ in posed]
-    there = [image for image in images if image.is_file()]
-    lens = shared_lens(path, stored_size(there or images), intrinsics)
+    header = most_frequent_header([image for image in images if image.is_file()] or images)
+    lens = shared_lens(path, header.shown_size, header.size, intrinsics=intrinsics)
     has_pose = [bool(np.isfinite(pose).all()) for _, pose in posed]
     if not any(has_pose):
         raise DataError(
@@ -365,7 +368,14 @@ def read_tum(path: Path, intrinsics: Intrinsics | None = None) -> Recording:
         if known
     )
     dropped |= {name: NO_POSE for name, known in zip(names, has_pose, strict=True) if not known}
-    return Recording(path=listed, scene_id=path.resolve().name, frames=frames, dropped=dropped)
+    return Recording(
+        path=listed,
+        scene_id=path.resolve().name,
+        frames=frames,
+        dropped=dropped,
+        aligned=True,
+        honours_exif=True,
+    )
 
 
 _Posed = list[tuple[Path, NDArray[np.float64]]]

@@ -33,6 +33,7 @@ SCALED = "rotation scaled by"
 SKEWED = "pose is no rigid motion"
 NO_MATRIX = "no camera-to-world matrix of numbers"
 NO_IMAGE = "no image"
+NEEDS_HEIF = "HEIC image, which pillow-heif decodes"
 NO_POSE = "no pose"
 OTHER_SHAPE = "image of another shape than its intrinsics are for"
 TURNED = "image turned by 90° against its intrinsics"
@@ -46,6 +47,7 @@ _REMEDIES = {
     SKEWED: "write camera-to-world matrices whose upper left 3x3 is a rotation",
     NO_MATRIX: "give each image a text file of its name with the 16 numbers of a 4x4 matrix",
     NO_POSE: "give each image a pose under its name",
+    NEEDS_HEIF: "pip install 'raytran[heic]', or export the images as JPEG",
     NO_IMAGE: "check that its images lie beside it under the names it gives",
 }
 """What to do if no frame is left, by the most frequent reason."""
@@ -104,7 +106,7 @@ class OpenScan(ABC):
 
     @abstractmethod
     def color_bytes(self, index: int) -> bytes | None:
-        """Return usable frame ``index`` as stored, if that is a JPEG or PNG of ``image_size``, else None.
+        """Return usable frame ``index`` as stored, if it is a JPEG or PNG that is used as it is, else None.
 
         Raises:
             DataError: it cannot be read.

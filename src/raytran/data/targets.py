@@ -226,7 +226,7 @@ def _scan_surface(path: Path, _content: str) -> tuple[NDArray, NDArray]:
     """
     try:
         with np.errstate(all="ignore"):  # what numbers there are is looked at below
-            mesh = trimesh.load(path, process=False)
+            mesh = trimesh.load(path, process=False, skip_materials=True)
     except Exception as error:  # a damaged file can fail anywhere in trimesh
         raise DataError(f"cannot read the mesh {path} ({str(error)[:80]!r}): copy it again") from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):

@@ -83,6 +83,8 @@ _STARTER_ENDED = (
     "the process that started this one has ended: it said why, or it was killed; give the same command "
     "again, with resume=auto to go on with a run"
 )
+_NUMBERS = re.compile(r"(up|intrinsics)=\s*([-+.\deE]+(?:\s*,\s*[-+.\deE]+)+)\s*")
+"""Settings whose value may be several numbers, as typed."""
 
 _TYPED_FULL_ERROR = os.environ.get(_FULL_ERROR)
 
@@ -123,6 +125,7 @@ def _compose_or_exit(name: str, command: Callable[[], Any], typed: str | None) -
             stream.reconfigure(errors="backslashreplace")  # a file's name need not be text
     _end_with_starter()
     _set_full_error("1")  # Hydra then raises instead of printing; the task restores what the user has set
+    sys.argv[1:] = with_number_lists(sys.argv[1:])
     try:
         if name in _KEEP_A_LOG:
             check_run_folder(sys.argv[1:])
@@ -317,6 +320,15 @@ def typed_settings(hydra_config: Any) -> list[str]:
     """
     typed: Any = OmegaConf.to_container(hydra_config.overrides.task)
     return [str(item) for item in typed]
+
+
+def with_number_lists(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line with ``up=1,2,3``, which is one value, as ``up=[1,2,3]``.
+
+    To Hydra commas are those of a sweep.
+    """
+    typed = ((word, _NUMBERS.fullmatch(word)) for word in words)
+    return [word if match is None else f"{match[1]}=[{match[2]}]" for word, match in typed]
 
 
 def name_positional(words: Sequence[str], key: str) -> list[str]:

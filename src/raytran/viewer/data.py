@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from raytran.data.images import decode_image
 from raytran.data.scannet.text import are_rigid
 from raytran.data.text import as_name, parse_json
 from raytran.errors import DataError, RaytranError
@@ -32,7 +33,6 @@ from raytran.limits import (
     BOX_SIDE,
     FOCAL_LENGTH,
     MATRIX_ENTRY,
-    MAX_SIDE,
     PIXEL,
     POSITION,
     SCORE,
@@ -341,7 +341,7 @@ def _read_mesh(path: Path) -> trimesh.Trimesh | None:
         return None
     try:
         with np.errstate(all="ignore"):  # what numbers there are is looked at below
-            mesh = trimesh.load_mesh(path, process=False)
+            mesh = trimesh.load_mesh(path, process=False, skip_materials=True)
     except Exception as error:  # trimesh raises whatever its parser stumbles over
         raise DataError(f"cannot read the mesh {path} ({str(error)[:80]!r}): predict again") from error
     if not isinstance(mesh, trimesh.Trimesh) or not (np.abs(mesh.vertices) <= POSITION.high).all():
@@ -350,11 +350,7 @@ def _read_mesh(path: Path) -> trimesh.Trimesh | None:
 
 
 def _image(content: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    # No other decoder than that of what is written.
-    with Image.open(io.BytesIO(content.tobytes()), formats=["JPEG"]) as image:
-        if max(image.size) > MAX_SIDE:
-            raise ValueError(f"a frame has {image.width} x {image.height} pixels")
-        return np.asarray(image.convert("RGB"))
+    return decode_image(content.tobytes(), name=f"of a frame in {FILE}").permute(1, 2, 0).numpy()
 
 
 def _truth(arrays: Mapping[str, NDArray[Any]]) -> ObjectSet:

@@ -115,12 +115,22 @@ def check_cameras(raw: RawScan, matches: Matches) -> CameraCheck:
     # The stored reading comes first, then plain ones: among equals the first is taken.
     best = max(candidates, key=lambda candidate: round(score.share(candidate), 2))
     stored = score.share(Correction())
-    if not (score.share(best) > stored + _CLEARLY_BETTER and score.share(best) > _TIMES_BETTER * stored):
+    if not is_clearly_better(score.share(best), stored):
         best = Correction()
     best = _with_better_intrinsics(replace(best, intrinsics=None), scaled, score)
     agrees, depth = score.triangulate(best)
     findings = _findings(raw, best, len(matches), stored, float(agrees.mean()))
     return CameraCheck(best, findings, agrees, depth)
+
+
+def agreement(raw: RawScan, matches: Matches) -> float:
+    """Return the share of matches that agree with a scan's cameras as stored; 0 of too few matches."""
+    return _Score(raw, matches).share(Correction()) if len(matches) >= _MIN_MATCHES else 0.0
+
+
+def is_clearly_better(share: float, other: float) -> bool:
+    """Whether a share of agreeing matches is clearly larger than that of another reading."""
+    return share > other + _CLEARLY_BETTER and share > _TIMES_BETTER * other
 
 
 class _Score:

@@ -308,10 +308,10 @@ def _draw_panel(
 def _draw_up(axes: Axes, cameras: CameraReading) -> None:
     """Draw where up is by the cameras, at the mean camera; nothing if they do not tell."""
     poses = cameras.world_from_camera
-    measured, _ = measured_up(poses)
+    measured = measured_up(poses)
     if measured is None:
         return
-    up, start = measured[[0, 2]], poses[:, :3, 3].mean(axis=0)[[0, 2]]
+    up, start = measured.direction[[0, 2]], poses[:, :3, 3].mean(axis=0)[[0, 2]]
     low, high = axes.get_ylim()
     length = 0.3 * (high - low)
     tip = float(start[1] + 1.25 * length * up[1])

@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from raytran.data.images import IMAGE_ENDINGS
 from raytran.data.scannet.text import INFO_FILES
 from raytran.errors import DataError
 
@@ -45,7 +46,7 @@ fusion the others."""
 
 _DEPTH_INTRINSICS = ("intrinsic/intrinsic_depth.txt", "intrinsics/intrinsic_depth.txt", "intrinsic_depth.txt")
 
-_IMAGE_ENDINGS = (".bmp", ".tif", ".tiff", ".webp", ".png", ".jpeg", ".jpg")
+_IMAGE_ENDINGS = IMAGE_ENDINGS[::-1]
 """Where a frame comes in several, the last one counts."""
 _CPP_FRAME = re.compile(r"frame-(\d+)\.(color|pose)\.(\w+)")
 _FLAT_FRAME = re.compile(r"(\d+)\.(\w+)")

@@ -7,7 +7,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from raytran.data.images import decode_image, has_shape, is_turned, stored_size, stored_sizes
+from raytran.data.images import (
+    OrientationTags,
+    decode_image,
+    has_shape,
+    image_headers,
+    is_turned,
+    kept_bytes,
+    most_frequent_header,
+    orientation_tags,
+    white_level,
+)
 from raytran.data.scan import (
     NO_IMAGE,
     NO_MATRIX,
@@ -33,6 +43,7 @@ from raytran.data.scannet.text import (
     axis_alignment,
     camera_matrix,
     check_intrinsics,
+    fits_better,
     header_intrinsics,
     pose_faults,
     read_header,
@@ -66,11 +77,13 @@ class Scan(OpenScan):
         image_path: file of each usable frame.
         other_size: ``(H, W)`` of the images that are not stored in ``image_size``, by their position; they
             have the same aspect.
+        tags: EXIF orientations of the images, if any is known; None: they are read as they are stored.
     """
 
     folder: Path
     image_path: tuple[Path, ...]
     other_size: dict[int, tuple[int, int]] = field(default_factory=dict)
+    tags: OrientationTags | None = None
 
     @property
     def path(self) -> Path:
@@ -82,8 +95,10 @@ class Scan(OpenScan):
         if index in self.other_size:
             return None
         path = self.image_path[index]
+        if self._turn(index) != 1:
+            return None
         try:
-            return path.read_bytes()
+            return kept_bytes(path.read_bytes())
         except OSError as error:
             raise DataError(
                 f"cannot read the image {path} ({error.strerror}): copy or export it again"
@@ -93,12 +108,25 @@ class Scan(OpenScan):
         """See ``OpenScan``."""
         path = self.image_path[index]
         stored = self.other_size.get(index, self.image_size)
-        size = image_size or (self.image_size if index in self.other_size else None)
-        image = decode_image(path, name=str(path), image_size=size, stored=stored)
+        image = decode_image(
+            path,
+            name=str(path),
+            image_size=image_size or (self.image_size if index in self.other_size else None),
+            stored=stored,
+            orientation=self._turn(index),
+            white=lambda: self._white,
+        )
         return image.permute(1, 2, 0).numpy()
 
     def close(self) -> None:
         """Do nothing: no file is open."""
+
+    @cached_property
+    def _white(self) -> int:
+        return white_level(self.image_path)
+
+    def _turn(self, index: int) -> int:
+        return 1 if self.tags is None else self.tags.turn(index)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -172,17 +200,15 @@ def read_scan(
         raise none_usable(folder, dropped)
     header = header or folder / f"{folder.name}.txt"
     facts = read_header(header)
-    found = stored_sizes([images[name] for name in names])
     matrix, intrinsics_file = _intrinsics(layout, header, facts, intrinsics)
+    headers = image_headers([images[name] for name in names])
+    common = most_frequent_header([images[name] for name in names], headers)
+    # Of pictures on their side, intrinsics may be for those that an EXIF orientation turns upright.
+    is_shown = fits_better(matrix, common.shown_size, common.size)
+    found = [each if each is None else each.shown_size if is_shown else each.size for each in headers]
     image_size, of_all = _fitting_size(
-        [size for size in found if size is not None] or [stored_size([images[name] for name in names])],
-        partial(
-            check_intrinsics,
-            matrix,
-            intrinsics_file,
-            header=facts,
-            any_size=any_size,
-        ),
+        [size for size in found if size is not None],
+        partial(check_intrinsics, matrix, intrinsics_file, header=facts, any_size=any_size),
     )
     # An image whose header cannot be read is named when it is read.
     sizes = [size or image_size for size in found]
@@ -192,11 +218,13 @@ def read_scan(
             dropped[name] = TURNED if is_turned(size, image_size) else OTHER_SHAPE
     names = [name for name, has_right_shape in zip(names, fits, strict=True) if has_right_shape]
     sizes = [size for size in sizes if has_shape(size, image_size)]
+    paths = tuple(images[name] for name in names)
     return Scan(
         scene_id=folder.name,
         folder=folder,
         frame_id=tuple(names),
-        image_path=tuple(images[name] for name in names),
+        image_path=paths,
+        tags=orientation_tags(paths, applied=True) if is_shown else None,
         world_from_camera=torch.from_numpy(poses[[fault is None for fault in faults]][fits]),
         # In images of one aspect, brought to one size, all have the same.
         intrinsics=of_all.expand(len(names), 3, 3),

@@ -214,6 +214,13 @@ def check_intrinsics(
     return torch.from_numpy(matrix[:3, :3].copy())
 
 
+def fits_better(matrix: NDArray[np.float64], size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether a camera matrix has its principal point nearer to the middle of one size than of another."""
+    center = matrix[0, 2], matrix[1, 2]
+    near, far = (center_offset(center, each) for each in (size, other))
+    return size != other and near < far
+
+
 def _start_of(path: Path) -> bytes:
     with path.open("rb") as file:
         return file.read(_MAX_BYTES)
