@@ -85,7 +85,7 @@ def _faults(views: Views) -> dict[str, Tensor]:
     """Return which views have each of some faults, ``(1, N)`` bool, by what to say of it."""
     height, width = views.image_size
     matrix, images = views.intrinsics, views.images
-    focal, middle = matrix[..., [0, 1], [0, 1]], matrix[..., :2, 2]
+    focal, middle = matrix.diagonal(dim1=-2, dim2=-1)[..., :2], matrix[..., :2, 2]
     size = torch.stack([torch.full_like(middle[..., 0], side) for side in (width, height)], dim=-1)
     last_row = torch.stack([torch.full_like(middle[..., 0], value) for value in (0.0, 0.0, 1.0)], dim=-1)
     faults = {
