@@ -55,7 +55,6 @@ NAMES = [
         "trail ",
         "\ttab",
         "new\nline",
-        "",
         "\x1b[31m",
         "null",
         "Null",
@@ -164,6 +163,15 @@ def test_a_path_arrives_as_typed(name):
     assert value_of(f"scene={quoted(name)}") == name
 
 
+@pytest.mark.parametrize(
+    ("command", "word"), [("predict", "scene="), ("train", "data.root="), ("demo", "output=")]
+)
+def test_nothing_is_no_path(command, word):
+    """Else it were the folder that one is in: an unset variable of a shell leaves nothing."""
+    with pytest.raises(ConfigError, match=rf"{word} is empty: give a path"):
+        literal_paths(command, [word])
+
+
 def test_a_path_that_looks_like_a_missing_value():
     assert value_of(literal_paths("predict", ["scene=???"])[0]) == "./???"
 
@@ -210,6 +218,8 @@ def test_what_is_in_quotes_is_hydras(typed, meant):
         ("train", "data.make.cads=null", True),
         ("train", "model.backbone.encoder.weights=null", True),
         ("train", "init_from=null", False),
+        ("predict", "cads=", True),
+        ("prepare", "check=", True),
     ],
 )
 def test_null_means_none_where_that_is_a_choice(command, word, null):
