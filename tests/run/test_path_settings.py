@@ -287,7 +287,10 @@ def test_a_run_cannot_be_kept_where_hydra_reads_a_reference(word):
     check_run_folder(["data.root=${a}", 'output_dir="${outputs}/x"'])
 
 
-def test_a_word_without_a_key_may_have_an_equals_sign():
+def test_a_word_without_a_key_may_have_an_equals_sign(tmp_path, monkeypatch):
+    (tmp_path / "a=b").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert name_positional(["a=b", "port=0"], "folder") == ['folder="a=b"', "port=0"]
     assert name_positional(["/x/a=b", "./a=b", "部=屋"], "folder") == [
         'folder="/x/a=b"',
         'folder="./a=b"',

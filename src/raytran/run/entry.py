@@ -318,11 +318,16 @@ def name_positional(words: Sequence[str], key: str) -> list[str]:
     named: list[str] = []
     before = ""
     for word in words:
-        name, is_setting, _ = word.partition("=")
-        is_path = not (is_setting and _KEY.fullmatch(name)) and not word.startswith("-")
-        named.append(f"{key}={quoted(word)}" if is_path and before not in _WITH_VALUE else word)
+        is_other = word.startswith("-") or before in _WITH_VALUE or _is_setting(word)
+        named.append(word if is_other else f"{key}={quoted(word)}")
         before = word
     return named
+
+
+def _is_setting(word: str) -> bool:
+    """Return whether a word is ``key=value``, and not the name of a folder that has an equals sign."""
+    key, equals, _ = word.partition("=")
+    return bool(equals and _KEY.fullmatch(key)) and not os.path.exists(word)
 
 
 def _exit_if_refused(error: BaseException) -> None:
