@@ -54,6 +54,36 @@ def test_a_full_disk_is_one_sentence(capsys, number):
         assert sentence.startswith(f"raytran: cannot write out/a.png ({os.strerror(number)}): make room")
 
 
+@pytest.mark.parametrize(
+    ("command_name", "typed"),
+    [
+        ("predict", ["scene={}", "output=x"]),
+        ("predict", ["scene=.", "output={}"]),
+        ("predict", ["scene=.", "output=x", "checkpoint={}"]),
+        ("prepare", ["check={}"]),
+        ("train", ["output_dir={}", "preset=tiny"]),
+        ("curriculum", ["outputs={}", "preset=tiny"]),
+        ("view", ["folder={}"]),
+    ],
+)
+@pytest.mark.parametrize("path", ["a" * 5000, "b" * 300], ids=["path", "name"])
+def test_a_path_that_the_system_refuses_is_one_sentence(command_name, typed, path, tmp_path, command):
+    done = command(command_name, *[word.format(path) for word in typed], folder=tmp_path)
+    (sentence,) = done.stderr.splitlines()
+    assert done.returncode == 1
+    assert "(File name too long): " in sentence
+    assert len(sentence) <= 300
+
+
+def test_a_file_in_the_place_of_a_folder_is_one_sentence(tmp_path, command):
+    (tmp_path / "file").touch()
+    done = command("train", "preset=tiny", "output_dir=file/x", folder=tmp_path)
+    assert done.returncode == 1
+    assert (
+        done.stderr == "raytran: cannot use file/x (Not a directory): choose another path, or mend this one\n"
+    )
+
+
 def test_a_defect_keeps_its_traceback():
     with pytest.raises(ZeroDivisionError):
         run_or_exit(lambda cfg: 1 / 0, OmegaConf.create())

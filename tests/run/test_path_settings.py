@@ -55,7 +55,6 @@ NAMES = [
         "trail ",
         "\ttab",
         "new\nline",
-        "",
         "\x1b[31m",
         "null",
         "Null",
@@ -164,6 +163,15 @@ def test_a_path_arrives_as_typed(name):
     assert value_of(f"scene={quoted(name)}") == name
 
 
+@pytest.mark.parametrize(
+    ("command", "word"), [("predict", "scene="), ("train", "data.root="), ("demo", "output=")]
+)
+def test_nothing_is_no_path(command, word):
+    """Else it were the folder that one is in: an unset variable of a shell leaves nothing."""
+    with pytest.raises(ConfigError, match=rf"{word} is empty: give a path"):
+        literal_paths(command, [word])
+
+
 def test_a_path_that_looks_like_a_missing_value():
     assert value_of(literal_paths("predict", ["scene=???"])[0]) == "./???"
 
@@ -210,6 +218,8 @@ def test_what_is_in_quotes_is_hydras(typed, meant):
         ("train", "data.make.cads=null", True),
         ("train", "model.backbone.encoder.weights=null", True),
         ("train", "init_from=null", False),
+        ("predict", "cads=", True),
+        ("prepare", "check=", True),
     ],
 )
 def test_null_means_none_where_that_is_a_choice(command, word, null):
@@ -277,7 +287,10 @@ def test_a_run_cannot_be_kept_where_hydra_reads_a_reference(word):
     check_run_folder(["data.root=${a}", 'output_dir="${outputs}/x"'])
 
 
-def test_a_word_without_a_key_may_have_an_equals_sign():
+def test_a_word_without_a_key_may_have_an_equals_sign(tmp_path, monkeypatch):
+    (tmp_path / "a=b").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert name_positional(["a=b", "port=0"], "folder") == ['folder="a=b"', "port=0"]
     assert name_positional(["/x/a=b", "./a=b", "部=屋"], "folder") == [
         'folder="/x/a=b"',
         'folder="./a=b"',

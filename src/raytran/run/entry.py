@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import functools
 import io
 import os
@@ -64,6 +65,12 @@ _KEY = re.compile(r"[+~]{0,2}[A-Za-z_][\w./@:-]*")
 
 _SEVERAL_VALUES = re.compile(r"Ambiguous value for argument '(.*)'$", re.DOTALL)
 """How Hydra begins to say that a comma makes a sweep of a single run."""
+
+_REFUSALS = {
+    *(errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP, errno.EACCES, errno.EPERM, errno.EROFS),
+    *(errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.ESTALE, errno.EINVAL, errno.EILSEQ),
+}
+"""Numbers of errors by which a system says that a path or a disk will not do."""
 
 _UNKNOWN = re.compile(r"Could not override '(.*)'$")
 """How Hydra begins to say that there is no such setting."""
@@ -147,8 +154,13 @@ def _compose_or_exit(name: str, command: Callable[[], Any], typed: str | None) -
             raise
         extras = "'raytran[sweep]' brings Optuna's sweeper, 'raytran[cluster]' the launcher for SLURM"
         _exit_with(ConfigError(f"{_first_line(error)}: it is not installed; pip install {extras}"))
+    except OSError as error:
+        _set_full_error(typed)
+        _exit_if_refused(error)
+        raise
     except OmegaConfBaseException as error:
         _set_full_error(typed)
+        _exit_if_refused(error)
         # A resolver of ours that objects is wrapped by OmegaConf; its message is the clearer one.
         _exit_with(ConfigError(_first_line(error).split("resolving interpolation: ")[-1]))
 
@@ -271,6 +283,9 @@ def run_or_exit(function: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
         return function(cfg)
     except RaytranError as error:
         _exit_with(error)
+    except OSError as error:
+        _exit_if_refused(error)
+        raise
     except InstantiationException as error:
         # Hydra wraps what a constructor raised; a message of ours is clearer without the wrapping.
         if isinstance(error.__cause__, RaytranError):
@@ -341,11 +356,32 @@ def name_positional(words: Sequence[str], key: str) -> list[str]:
     named: list[str] = []
     before = ""
     for word in words:
-        name, is_setting, _ = word.partition("=")
-        is_path = not (is_setting and _KEY.fullmatch(name)) and not word.startswith("-")
-        named.append(f"{key}={quoted(word)}" if is_path and before not in _WITH_VALUE else word)
+        is_other = word.startswith("-") or before in _WITH_VALUE or _is_setting(word)
+        named.append(word if is_other else f"{key}={quoted(word)}")
         before = word
     return named
+
+
+def _is_setting(word: str) -> bool:
+    """Return whether a word is ``key=value``, and not the name of a folder that has an equals sign."""
+    key, equals, _ = word.partition("=")
+    return bool(equals and _KEY.fullmatch(key)) and not os.path.exists(word)
+
+
+def _exit_if_refused(error: BaseException) -> None:
+    """Leave with one sentence if the system refused a path for what it is, or for where it lies.
+
+    That a file is not there, or is already, is for those to say who look for it. OmegaConf wraps what its
+    resolvers raise.
+    """
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, OSError):
+        cause = cause.__cause__ or cause.__context__
+    if cause is not None and cause.errno in _REFUSALS and cause.filename is not None:
+        path = os.fsdecode(cause.filename) if isinstance(cause.filename, str | bytes) else cause.filename
+        refused = ConfigError(f"cannot use {path} ({cause.strerror}): choose another path, or mend this one")
+        refused.__cause__ = cause
+        _exit_with(refused)
 
 
 def _exit_with(error: RaytranError) -> None:

@@ -77,11 +77,14 @@ def literal_paths(command: str, words: Sequence[str]) -> list[str]:
     """Return the words of a command line with quotes, for Hydra, around the paths that need them.
 
     A path that is in quotes already keeps them, and what Hydra reads in them. In a sweep a comma outside of
-    quotes parts paths. ``null`` stays Hydra's word where a setting may be null.
+    quotes parts paths. Where a setting may be null, ``null`` stays Hydra's word, and nothing means it.
 
     Args:
         command: name of its config, e.g. ``train``.
         words: settings and options of Hydra.
+
+    Raises:
+        ConfigError: nothing is typed where there must be a path.
     """
     paths, sweeps = PATH_SETTINGS.get(command, ()), _is_sweep(words)
     of_a_rank = any(word.startswith(_OF_A_RANK) for word in words)
@@ -135,8 +138,10 @@ def _is_sweep(words: Sequence[str]) -> bool:
 
 def _value(key: str, typed: str, command: str, *, sweeps: bool) -> str:
     may_be_null = key in _NULL_IN_GROUPS or key in _null_by_default(command)
-    if typed.lower() == "null" and may_be_null:
-        return typed
+    if typed.lower() in ("null", "") and may_be_null:
+        return "null"
+    if not typed:
+        raise ConfigError(f"{key}= is empty: give a path behind it, or leave it out")
     if key in _LISTS and not sweeps:
         is_list = typed.startswith("[") and typed.endswith("]")
         return f"[{','.join(_items(typed[1:-1])) if is_list else _item(typed)}]"
