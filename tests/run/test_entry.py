@@ -54,6 +54,13 @@ def test_a_full_disk_is_one_sentence(capsys, number):
         assert sentence.startswith(f"raytran: cannot write out/a.png ({os.strerror(number)}): make room")
 
 
+def test_an_interrupt_is_one_line_and_exit_code_130(capsys):
+    with pytest.raises(SystemExit) as stop:
+        run_or_exit(raise_error(KeyboardInterrupt()), OmegaConf.create())
+    assert stop.value.code == 130
+    assert capsys.readouterr().err.startswith("raytran: interrupted")
+
+
 def test_a_defect_keeps_its_traceback():
     with pytest.raises(ZeroDivisionError):
         run_or_exit(lambda cfg: 1 / 0, OmegaConf.create())
