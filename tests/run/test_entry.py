@@ -84,6 +84,13 @@ def test_a_file_in_the_place_of_a_folder_is_one_sentence(tmp_path, command):
     )
 
 
+def test_an_interrupt_is_one_line_and_exit_code_130(capsys):
+    with pytest.raises(SystemExit) as stop:
+        run_or_exit(raise_error(KeyboardInterrupt()), OmegaConf.create())
+    assert stop.value.code == 130
+    assert capsys.readouterr().err.startswith("raytran: interrupted")
+
+
 def test_a_defect_keeps_its_traceback():
     with pytest.raises(ZeroDivisionError):
         run_or_exit(lambda cfg: 1 / 0, OmegaConf.create())

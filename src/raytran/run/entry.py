@@ -79,6 +79,8 @@ _MOST_SUGGESTIONS = 3
 
 _KEEP_A_LOG = ("train", "curriculum")
 """Commands for which Hydra writes files of its own into the folder of the run."""
+_INTERRUPTED = 130
+"""Exit code by which a shell knows that Ctrl-C ended a command."""
 
 _WITH_VALUE = {
     *("--cfg", "-c", "--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn", "--info", "-i"),
@@ -293,6 +295,11 @@ def run_or_exit(function: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
         raise
     except OmegaConfBaseException as error:
         _exit_with(ConfigError(f"{str(error).splitlines()[0]} (see --cfg job for all settings)"))
+    except KeyboardInterrupt as stop:
+        sys.stderr.write(
+            "raytran: interrupted\n"
+        )
+        raise SystemExit(_INTERRUPTED) from stop
     except Exception as error:
         full = disk_full(error)
         if full is None:
