@@ -101,12 +101,13 @@ class Input:
             ending = rng.choice(endings)
             path = rng.choice([path for path in files if path.suffix == ending])
             kind = rng.random()
-            if kind < 0.02:
-                path.unlink(missing_ok=True)
-            elif kind < 0.03:
-                path.unlink(missing_ok=True)
-                path.mkdir(exist_ok=True)
-            elif path.is_file():
+            if not path.is_file():
+                continue
+            if kind < 0.03:
+                path.unlink()
+                if kind < 0.01:
+                    path.mkdir()
+            else:
                 mutate_file(path, rng)
 
 
