@@ -61,7 +61,7 @@ _MODULES_A_TENSOR = 20
 
 _NOT_BUILT = (
     *(ConfigError, TypeError, ValueError, RuntimeError, AttributeError, KeyError, IndexError, MemoryError),
-    *(OverflowError, RecursionError),
+    *(OverflowError, RecursionError, AssertionError),
 )
 """What our classes, and PyTorch's, say of settings that do not go together."""
 
