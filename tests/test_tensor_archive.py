@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from raytran.tensor_archive import load_archive
+from raytran.tensor_archive import load_archive, load_stream
 
 
 def save(path, content):
@@ -166,3 +166,39 @@ def test_parts_that_lie_over_each_other_are_refused(tmp_path):
     end = struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, 54, 54, len(directory), start, 0)
     path.write_bytes(whole[:start] + directory + end)
     refused(path)
+
+
+def in_the_old_form(path, content):
+    torch.save(content, path, _use_new_zipfile_serialization=False)
+    return path
+
+
+def test_files_from_before_pytorch_1_6_are_read(tmp_path):
+    state = torch.nn.BatchNorm1d(3).state_dict()
+    found = load_stream(in_the_old_form(tmp_path / "file", state))
+    assert all(torch.equal(found[name], value) for name, value in state.items())
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"x": torch.zeros(1).expand(10**10)},
+        {"x": bytearray(5)},
+        {"x": np.zeros(3)},
+        {"x": torch.Generator},
+    ],
+)
+def test_files_of_the_old_form_that_claim_more_than_they_hold_are_refused(tmp_path, content):
+    with pytest.raises((ValueError, pickle.UnpicklingError)):
+        load_stream(in_the_old_form(tmp_path / "file", content))
+
+
+def test_files_of_the_old_form_that_are_cut_or_changed_are_refused(tmp_path):
+    path = in_the_old_form(tmp_path / "file", {"x": torch.arange(77.0)})
+    whole = path.read_bytes()
+    larger = whole.replace(b"K\x4dN", b"J\xff\xff\xff\x7fN")
+    assert larger != whole
+    for changed in (b"", whole[:1], whole[:100], whole[:-50], larger):
+        path.write_bytes(changed)
+        with pytest.raises((ValueError, pickle.UnpicklingError)):
+            load_stream(path)

@@ -16,6 +16,7 @@ import pickletools
 import struct
 import zipfile
 from collections import OrderedDict
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,6 +33,11 @@ _MAX_DEPTH = 100
 _MAX_DIMENSIONS = 16
 _MAX_INTEGER = 2**72
 """Python needs quadratic time for a dictionary of longer ones that are chosen for it."""
+
+_MAGIC = 2**80
+"""Above the number with which a file from before PyTorch 1.6 begins."""
+
+_STREAM_PICKLES = 5
 
 _MAX_CLAIM = 2
 """Bytes of all tensors for each byte of the file: two names may share their numbers."""
@@ -77,6 +83,37 @@ def load_archive(path: Path) -> Any:
         raise ValueError(f"{type(error).__name__}: {error}") from error
 
 
+def load_stream(path: Path) -> Any:
+    """Return what ``torch.save`` wrote before PyTorch 1.6, on the CPU: five pickles, then all numbers.
+
+    Raises:
+        pickle.UnpicklingError: it holds more than tensors and plain values.
+        ValueError: it is cut short, or claims more than it holds.
+        OSError: it cannot be read.
+    """
+    size = path.stat().st_size
+    try:
+        with path.open("rb") as file:
+            for _ in range(_STREAM_PICKLES):
+                start = file.tell()
+                content = file.read(MAX_PICKLE)
+                length = _pickle_length(content)
+                _check_opcodes(content[:length], largest=_MAGIC)
+                _count(_ClaimReader(content[:length], None, size).load(), 0, {})
+                file.seek(start + length)
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, ValueError, OSError):
+        raise
+    except Exception as error:  # a made-up file can fail anywhere in the readers
+        raise ValueError(f"{type(error).__name__}: {error}") from error
+
+
+def _pickle_length(content: bytes) -> int:
+    """Return the bytes of the pickle with which ``content`` begins."""
+    *_, (_, _, position) = pickletools.genops(content)
+    return 1 + (position or 0)
+
+
 def _check_archive(archive: zipfile.ZipFile, path: Path) -> None:
     """Raise unless a zip is as PyTorch writes them, and every part of it fits its check sum."""
     parts = archive.infolist()
@@ -120,20 +157,25 @@ def read_claims(content: bytes, archive: zipfile.ZipFile, root: str, size: int) 
         ValueError: it claims more than the file holds.
     """
     _check_opcodes(content)
-    reader = _ClaimReader(content, archive, f"{root}data/", _MAX_CLAIM * size)
-    found = reader.load()
+    folder = f"{root}data/"
+    stored = {
+        part.filename.removeprefix(folder): part.file_size
+        for part in archive.infolist()
+        if part.filename.startswith(folder)
+    }
+    found = _ClaimReader(content, stored, size).load()
     _count(found, 0, {})
     return found
 
 
-def _check_opcodes(content: bytes) -> None:
+def _check_opcodes(content: bytes, *, largest: int = _MAX_INTEGER) -> None:
     for count, (opcode, argument, _) in enumerate(pickletools.genops(content)):
         if opcode.name not in _OPCODES:
             raise pickle.UnpicklingError(f"{opcode.name} in its pickle")
         # Python's reader makes room for all numbers below that under which a value is put.
         if opcode.name == "LONG_BINPUT" and argument is not None and argument > len(content):
             raise ValueError("a value is put under too large a number")
-        if opcode.name == "LONG1" and argument is not None and abs(argument) >= _MAX_INTEGER:
+        if opcode.name == "LONG1" and argument is not None and abs(argument) > largest:
             raise ValueError("a number is too large")
         if count == _MAX_OPCODES:
             raise ValueError("its pickle is too long")
@@ -155,11 +197,17 @@ class _TensorClaim(NamedTuple):
 class _ClaimReader(pickle.Unpickler):
     """Reads a pickle of ``torch.save``; tensors become ``_TensorClaim``, and nothing else is made or run."""
 
-    def __init__(self, content: bytes, archive: zipfile.ZipFile, root: str, most_bytes: int) -> None:
+    def __init__(self, content: bytes, stored: Mapping[str, int] | None, size: int) -> None:
+        """Prepare to read.
+
+        Args:
+            content: the pickle.
+            stored: bytes of each tensor's numbers, by key; None: they stand behind the pickles.
+            size: bytes of the file.
+        """
         super().__init__(io.BytesIO(content))
-        self._sizes = {part.filename: part.file_size for part in archive.infolist()}
-        self._root = root
-        self._bytes_left = most_bytes
+        self._stored, self._size = stored, size
+        self._bytes_left = _MAX_CLAIM * size
 
     def find_class(self, module: str, name: str) -> Any:
         """Return the stand-in of a name, the only ones that a file can make anything of."""
@@ -177,13 +225,11 @@ class _ClaimReader(pickle.Unpickler):
 
     def persistent_load(self, reference: Any) -> _Storage:
         """Return the stand-in of a tensor's numbers, if the archive has so many."""
-        kind, storage, key, _, numel = reference
+        kind, storage, key, _, numel = reference[:5]
         item_size = _ITEM_SIZES[storage]
-        if (
-            kind != "storage"
-            or type(numel) is not int
-            or self._sizes[f"{self._root}{key}"] != numel * item_size
-        ):
+        if kind != "storage" or type(numel) is not int or not 0 <= numel * item_size <= self._size:
+            raise ValueError("a tensor is larger than the file")
+        if self._stored is not None and self._stored[key] != numel * item_size:
             raise ValueError("a tensor has other bytes than its pickle says")
         return _Storage(numel, item_size)
 

@@ -92,6 +92,7 @@ def nested(depth):
         ("model/heads/foreground/widths", [4] * 9_000),
         ("model/heads/foreground/widths", []),
         ("model/heads/foreground/widths", None),
+        ("model/heads/objects/queries", "a\nb\x1b[2J" * 100),
         ("model/heads", [{}]),
         ("model/heads", {}),
         ("model/backbone", nested(5)),

@@ -202,4 +202,11 @@ def work(kinds: Sequence[Input], seed: int, folder: Path, orders: Connection) ->
             number = orders.recv()
         except EOFError:
             return
-        orders.send(judge(kinds[number % len(kinds)], number, seed, folder, watch))
+        kind = kinds[number % len(kinds)]
+        try:
+            verdict = judge(kind, number, seed, folder, watch)
+        except Exception:  # of the fuzzer itself
+            watch.stop()
+            said = traceback.format_exc()[-3000:]
+            verdict = Verdict(number, kind.name, f"the fuzzer failed: {said[-200:]!r}", False, said, 0.0, 0.0)
+        orders.send(verdict)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from raytran.errors import CheckpointError
-from raytran.tensor_archive import load_archive
+from raytran.tensor_archive import load_archive, load_stream
 
 _log = logging.getLogger(__name__)
 
@@ -54,10 +54,7 @@ def read_state(path: Path, *, name: str, remedy: str) -> dict[str, Tensor]:
         raise CheckpointError(f"no {name} weights at {path}: {remedy}")
     try:
         # Some weights are still in the form from before PyTorch 1.6, which is no archive.
-        if zipfile.is_zipfile(path):
-            state = load_archive(path)
-        else:
-            state = torch.load(path, map_location="cpu", weights_only=True)
+        state = load_archive(path) if zipfile.is_zipfile(path) else load_stream(path)
     except Exception as error:  # torch.load raises whatever its unpickler meets
         raise CheckpointError(
             f"{path} is not a readable state dict ({str(error)[:80]!r}): download it again"

@@ -59,6 +59,12 @@ _MAX_NUMBER = 1e6
 _MODULES_A_TENSOR = 20
 """Most modules for each weight: there are containers, and functions without weights."""
 
+_NOT_BUILT = (
+    *(ConfigError, TypeError, ValueError, RuntimeError, AttributeError, KeyError, IndexError, MemoryError),
+    *(OverflowError, RecursionError, AssertionError),
+)
+"""What our classes, and PyTorch's, say of settings that do not go together."""
+
 _PLAIN = (str, int, float, bool, type(None))
 
 
@@ -151,15 +157,15 @@ def build_network(
         CheckpointError: the config asks for anything else; that is then neither imported nor run. Or the
             classes do not take these arguments, or a package in ``trust`` is not installed; or there are
             fewer weights than the network has.
-        ConfigError: see ``trusted_packages``; or a number is beyond what it can mean.
+        ConfigError: see ``trusted_packages``.
     """
     trusted = trusted_packages(trust)
     _check_extent(config, source)
-    check_settings(config, where=f"in {source}: model")
     try:
+        check_settings(config, where="model")
         with _at_most(max_tensors, source):
             built = _build(config, source, trusted)
-    except (TypeError, ValueError, RuntimeError, AttributeError, KeyError, IndexError, MemoryError) as error:
+    except _NOT_BUILT as error:
         whose = " or ".join(("raytran", *(name for name in own_packages(config) if name in trusted)))
         raise CheckpointError(
             f"the network described in {source} cannot be built ({_first_line(error)}): "
@@ -170,8 +176,10 @@ def build_network(
     return built
 
 
-def _first_line(error: Exception) -> str:
-    return str(error).partition("\n")[0][:120]
+def _first_line(error: BaseException) -> str:
+    """Return the beginning of a reason, which may hold text of the file."""
+    line = str(error).partition("\n")[0][:120]
+    return line if line.isprintable() else repr(line)
 
 
 def _check_extent(config: Any, source: object) -> None:

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
+from raytran.errors import ConfigError
+
 GROUPS = 4
 """Groups of the normalisation between two layers of an upsampler."""
 
@@ -46,6 +48,16 @@ class ForegroundHead(nn.Module):
         return logits.squeeze(1).unflatten(0, pixels.shape[:2])
 
 
+def check_widths(widths: Sequence[int], groups: int) -> None:
+    """Raise unless there are widths, each divisible by the number of groups of their normalisation.
+
+    Raises:
+        ConfigError: a width is not, or there is none.
+    """
+    if not widths or any(width % groups for width in widths):
+        raise ConfigError(f"widths={list(widths)} of a head: give one or more, each divisible by {groups}")
+
+
 def image_upsampler(channels: int, widths: Sequence[int], outputs: int) -> nn.Sequential:
     """Return transposed convolutions of stride 2, normalisation and non-linearity between them.
 
@@ -55,7 +67,11 @@ def image_upsampler(channels: int, widths: Sequence[int], outputs: int) -> nn.Se
         channels: C of the features ``(n, C, h, w)``.
         widths: channels after each layer but the last, each divisible by ``GROUPS``.
         outputs: channels of the result ``(n, outputs, s·h, s·w)`` with s = 2 to the number of layers.
+
+    Raises:
+        ConfigError: there is no width, or one that is not divisible.
     """
+    check_widths(widths, GROUPS)
     layers: list[nn.Module] = []
     for inputs, width in zip((channels, *widths[:-1]), widths, strict=True):
         layers += [

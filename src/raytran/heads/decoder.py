@@ -8,6 +8,8 @@ from collections.abc import Callable
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from raytran.errors import ConfigError
+
 
 class DecoderLayer(nn.Module):
     """Self-attention, attention to the voxels, feed-forward; normalisation comes before each.
@@ -18,6 +20,9 @@ class DecoderLayer(nn.Module):
         hidden: channels inside the feed-forward.
         voxel_attention: called with ``channels`` and ``num_heads``, returns what queries read voxels with;
             None for ``VoxelAttention``, as in the paper.
+
+    Raises:
+        ConfigError: ``channels`` is not a multiple of ``num_heads``.
     """
 
     def __init__(
@@ -29,6 +34,11 @@ class DecoderLayer(nn.Module):
         voxel_attention: Callable[..., nn.Module] | None = None,
     ) -> None:
         super().__init__()
+        if channels % num_heads:
+            raise ConfigError(
+                f"object head needs channels divisible by num_heads, got channels={channels}, "
+                f"num_heads={num_heads}"
+            )
         self.self_norm = nn.LayerNorm(channels)
         self.self_attention = nn.MultiheadAttention(channels, num_heads, batch_first=True)
         self.voxel_norm = nn.LayerNorm(channels)

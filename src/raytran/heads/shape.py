@@ -7,6 +7,8 @@ from collections.abc import Sequence
 
 from torch import Tensor, nn
 
+from raytran.heads.auxiliary import check_widths
+
 
 class ShapeHead(nn.Module):
     """A linear layer to 4³ cells, then four transposed 3D convolutions: 4 → 8 → 16 → 32 → 63 cells a side.
@@ -14,12 +16,16 @@ class ShapeHead(nn.Module):
     Args:
         channels: C of the query embedding.
         widths: channels at 4³, 8³, 16³ and 32³ cells, each divisible by ``GROUPS``.
+
+    Raises:
+        ConfigError: a width is not.
     """
 
     GROUPS = 4
 
     def __init__(self, *, channels: int = 256, widths: Sequence[int] = (256, 128, 64, 32)) -> None:
         super().__init__()
+        check_widths(widths, self.GROUPS)
         self.widths = tuple(widths)
         self.start = nn.Linear(channels, self.widths[0] * 4**3)
         layers: list[nn.Module] = []

@@ -17,6 +17,7 @@ import numpy as np
 
 from raytran.data.files import UNFINISHED, SettingsRecord, sweep, write_text
 from raytran.data.locks import lock_when_free
+from raytran.data.scan2cad import parse_entry
 from raytran.data.text import read_json_object
 from raytran.data.workers import work_on
 from raytran.errors import ConfigError, DataError
@@ -269,11 +270,19 @@ def _record(output: Path) -> SettingsRecord:
     return SettingsRecord(output / "rooms.json")
 
 
+def _entry(path: Path) -> dict[str, Any]:
+    """Return the annotation of one room, checked."""
+    entry = read_json_object(path)
+    try:
+        parse_entry(entry)
+    except DataError as error:
+        raise DataError(f"{path} is damaged ({error}): remove the folder of that room") from error
+    return entry
+
+
 def _write_lists(output: Path, splits: Sequence[RoomSplit]) -> int:
     """Write the split files and the annotations of all scans; return the number of objects."""
-    entries = [
-        read_json_object(annotation_path(output, scan_id)) for split in splits for scan_id in split.scan_ids
-    ]
+    entries = [_entry(annotation_path(output, scan_id)) for split in splits for scan_id in split.scan_ids]
     write_text(output / "scan2cad" / "full_annotations.json", json.dumps(entries))
     counts = {
         entry["id_scan"]: Counter(f"{m['catid_cad']}_{m['id_cad']}" for m in entry["aligned_models"])
