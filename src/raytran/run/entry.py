@@ -67,10 +67,10 @@ _SEVERAL_VALUES = re.compile(r"Ambiguous value for argument '(.*)'$", re.DOTALL)
 """How Hydra begins to say that a comma makes a sweep of a single run."""
 
 _REFUSALS = {
-    *(errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP, errno.EACCES, errno.EPERM, errno.EROFS),
-    *(errno.ENOSPC, errno.EDQUOT, errno.EIO, errno.ESTALE, errno.EINVAL, errno.EILSEQ),
+    *(errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP, errno.EACCES, errno.EPERM),
+    *(errno.EIO, errno.ESTALE, errno.EINVAL, errno.EILSEQ),
 }
-"""Numbers of errors by which a system says that a path or a disk will not do."""
+"""Numbers of errors by which a system says that a path will not do."""
 
 _UNKNOWN = re.compile(r"Could not override '(.*)'$")
 """How Hydra begins to say that there is no such setting."""
