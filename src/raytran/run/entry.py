@@ -182,9 +182,7 @@ def run_or_exit(function: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
     except OmegaConfBaseException as error:
         _exit_with(ConfigError(f"{str(error).splitlines()[0]} (see --cfg job for all settings)"))
     except KeyboardInterrupt as stop:
-        sys.stderr.write(
-            "raytran: interrupted\n"
-        )
+        sys.stderr.write("raytran: interrupted\n")
         raise SystemExit(_INTERRUPTED) from stop
     except Exception as error:
         full = disk_full(error)
