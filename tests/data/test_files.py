@@ -89,6 +89,9 @@ def test_a_full_disk_is_seen_behind_other_errors():
     assert disk_full(OSError(errno.ENOENT, "No such file")) is None
     assert disk_full(OSError("encoder error -2 when writing image file")).strerror  # Pillow's
     assert disk_full(ValueError()) is None
+    first, second = ValueError(), OSError(errno.ENOENT, "No such file")
+    first.__context__, second.__context__ = second, first  # raised again while it was handled
+    assert disk_full(first) is None
 
 
 def test_bytes_below(tmp_path):

@@ -308,7 +308,7 @@ def test_the_command_line_looks_for_what_was_typed(name, command, tmp_path):
     assert done.returncode == 1
     assert sentence.startswith("raytran: ")
     assert sentence.isprintable()
-    assert "frames" in sentence or "format" in sentence, "the folder was found, and is empty"
+    assert " is empty: give the folder of a scene" in sentence
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import csv
 import resource
+import shutil
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -164,6 +165,20 @@ def test_tensorboard_shows_steps_done_twice_once(tmp_path):
         *((0, 9.0), (1, 8.0)),
         *((2, 7.5), (3, 6.5), (4, 5.5)),
     ]
+
+
+def test_a_run_goes_on_where_events_cannot_be_written(tmp_path, caplog, capsys):
+    logger = tensorboard_logger(save_dir=str(tmp_path / "run"))
+    logger.log_metrics({"a": 1.0}, step=0)
+    logger.save()
+    shutil.rmtree(tmp_path / "run")
+    for step in range(1, 50):
+        logger.log_metrics({"a": 1.0}, step=step)
+        logger.save()
+    logger.finalize("success")
+    (said,) = caplog.messages
+    assert "no more events for TensorBoard" in said
+    assert capsys.readouterr().err == ""
 
 
 @pytest.fixture

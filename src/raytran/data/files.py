@@ -202,7 +202,9 @@ def disk_full(error: BaseException | None) -> OSError | None:
 
     The disk is full or read-only, or the file is larger than it may be.
     """
-    while error is not None:
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))  # an error raised a second time may come from itself
         if isinstance(error, OSError) and error.errno in _DISK_FULL:
             return error
         if isinstance(error, OSError) and str(error).startswith("encoder error"):

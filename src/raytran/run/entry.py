@@ -285,9 +285,6 @@ def run_or_exit(function: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
         return function(cfg)
     except RaytranError as error:
         _exit_with(error)
-    except OSError as error:
-        _exit_if_refused(error)
-        raise
     except InstantiationException as error:
         # Hydra wraps what a constructor raised; a message of ours is clearer without the wrapping.
         if isinstance(error.__cause__, RaytranError):
@@ -299,6 +296,7 @@ def run_or_exit(function: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
         sys.stderr.write("raytran: interrupted\n")
         raise SystemExit(_INTERRUPTED) from stop
     except Exception as error:
+        _exit_if_refused(error)
         full = disk_full(error)
         if full is None:
             raise

@@ -8,7 +8,10 @@ import io
 import logging
 import os
 import secrets
-from collections.abc import Iterator, Mapping
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 from netrc import NetrcParseError, netrc
 from pathlib import Path
 from typing import Any
@@ -199,7 +202,43 @@ def read_history(folder: Path) -> dict[str, list[tuple[int, float]]]:
 
 
 class ContinuedTensorBoard(TensorBoardLogger):
-    """Writes further event files into the folder of a run; what is logged twice after a resume shows once."""
+    """Writes further event files into the folder of a run; what is logged twice after a resume shows once.
+
+    Where the files cannot be written, on a full disk for instance, that is said once and the run goes on.
+    """
+
+    _is_failure_told = False
+
+    @rank_zero_only
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Log values."""
+        with self._told_once():
+            super().log_metrics(metrics, step)
+
+    @rank_zero_only
+    def save(self) -> None:
+        """Write what waits."""
+        with self._told_once():
+            super().save()
+
+    @rank_zero_only
+    def finalize(self, status: str) -> None:
+        """Write what waits and close the file."""
+        with self._told_once():
+            super().finalize(status)
+
+    @contextmanager
+    def _told_once(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, ValueError) as error:
+            failure = error if isinstance(error, OSError) else error.__cause__  # Lightning wraps it
+            if not isinstance(failure, OSError):
+                raise
+            if not self._is_failure_told:
+                said = "no more events for TensorBoard in %s (%s): make room there; training goes on"
+                _log.warning(said, self.log_dir, failure.strerror)
+            self._is_failure_told = True
 
     @rank_zero_only
     def continue_from(self, step: int) -> None:
@@ -220,11 +259,22 @@ def tensorboard_logger(*, save_dir: str) -> Any:
         ConfigError: the package is not installed.
     """
     try:
-        return ContinuedTensorBoard(save_dir=save_dir, name="tensorboard", version="")
+        logger = ContinuedTensorBoard(save_dir=save_dir, name="tensorboard", version="")
     except ModuleNotFoundError as error:
         raise ConfigError(
             "TensorBoard is not installed: pip install 'raytran[tensorboard]', or choose another logger="
         ) from error
+    threading.excepthook = partial(_leave_out_event_writers, before=threading.excepthook)
+    return logger
+
+
+def _leave_out_event_writers(
+    failure: threading.ExceptHookArgs, *, before: Callable[[threading.ExceptHookArgs], Any]
+) -> None:
+    """Show why a thread ended, unless it writes events and could not: the logger says that."""
+    is_writer = type(failure.thread).__name__ == "_AsyncWriterThread"
+    if not (is_writer and isinstance(failure.exc_value, OSError)):
+        before(failure)
 
 
 def wandb_logger(*, project: str, name: str, save_dir: str) -> Any:

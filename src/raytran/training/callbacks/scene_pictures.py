@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import shutil
 from pathlib import Path
@@ -65,7 +66,8 @@ class ScenePictures(pl.Callback):
         logged_at = step - 1  # where Lightning, which counts logged steps from 0, puts the scores
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
-                _log_tensorboard(logger, pictures, logged_at)
+                with contextlib.suppress(OSError):  # the logger says so
+                    _log_tensorboard(logger, pictures, logged_at)
             elif isinstance(logger, WandbLogger):
                 _log_wandb(logger, pictures, found, logged_at, grid_extent)
 
