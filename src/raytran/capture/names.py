@@ -18,13 +18,11 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
+from raytran.data.images import IMAGE_ENDINGS
 from raytran.data.scan import NO_POSE, numbers_first
 from raytran.errors import DataError
 
 _log = logging.getLogger(__name__)
-
-IMAGE_ENDINGS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
-"""Of the images that are read; where a name has no ending, the first of these that is there counts."""
 
 IMAGE_FOLDERS = ("images", "input", "rgb", "color", "image", "frames")
 """Folders of colour images that programs leave out of the names in their lists."""
@@ -35,7 +33,7 @@ UNCLEAR = "which image is meant is unclear"
 
 _OUTSIDE = "image is outside of the scene"
 
-_FOREIGN_ENDINGS = (".heic", ".heif", ".dng", ".exr", ".ppm", ".gif")
+_FOREIGN_ENDINGS = (".dng", ".exr", ".ppm", ".gif")
 """Endings of images that people convert to one of ``IMAGE_ENDINGS``, which keeps the rest of the name."""
 
 _MAX_FOLDERS = 1000
@@ -110,7 +108,7 @@ def unposed_images(images: Collection[Path], root: Path, taken: Collection[str])
     folders = sorted({image.parent for image in images})
     known = set(images)
     others = [
-        path for folder in folders if folder.is_dir() for path in images_in(folder) if path not in known
+        path for folder in folders if os.path.isdir(folder) for path in images_in(folder) if path not in known
     ]
     names = [frame_name(path.relative_to(os.path.abspath(root)).as_posix()) for path in others]
     return dict.fromkeys(unlike(names, taken), NO_POSE)
@@ -150,7 +148,7 @@ class Located:
     @property
     def num_found(self) -> int:
         """How many names have an image."""
-        return sum(isinstance(place, Path) and place.is_file() for place in self.places)
+        return sum(isinstance(place, Path) and os.path.isfile(place) for place in self.places)
 
     def report(self, listed_in: Path, root: Path) -> None:
         """Say how many images were found under other spellings.
@@ -183,7 +181,9 @@ def locate(names: Sequence[str], root: Path) -> Located:
     """
     search = _Search(Path(os.path.abspath(root)))
     places: list[Path | str] = [search.exact(name) for name in names]
-    missing = [i for i, place in enumerate(places) if not isinstance(place, Path) or not place.is_file()]
+    missing = [
+        i for i, place in enumerate(places) if not isinstance(place, Path) or not os.path.isfile(place)
+    ]
     for i in missing:
         places[i] = search.in_place(names[i]) or places[i]
     astray = [i for i in missing if not search.is_there(places[i])]
@@ -227,7 +227,7 @@ class _Search:
 
     def is_there(self, place: Path | str) -> bool:
         """Whether a place is an image, or unclear for good."""
-        return place.is_file() if isinstance(place, Path) else place == UNCLEAR
+        return os.path.isfile(place) if isinstance(place, Path) else place == UNCLEAR
 
     def in_place(self, name: str) -> Path | str | None:
         """Return the image that a name means if only its spelling differs; None if there is none."""
