@@ -94,6 +94,8 @@ def test_another_folder_is_no_other_spelling(fill):
 def test_two_folders_that_would_be_one_are_unclear(fill):
     root = fill("0.jpg", "1.jpg")
     assert found(root, "left/0.jpg", "right/0.jpg", "left/1.jpg", "right/1.jpg") == [None] * 4
+    # The list knows the folder by its own name, so it is no other one.
+    assert found(root, "left/0.jpg", "1.jpg") == [None, "1.jpg"]
     both = fill("images/0.jpg", "rgb/0.jpg", "images/1.jpg", "rgb/1.jpg")
     assert found(both / "images", "0.jpg", "1.jpg") == ["0.jpg", "1.jpg"]
 

@@ -187,7 +187,9 @@ def locate(names: Sequence[str], root: Path) -> Located:
     for i in missing:
         places[i] = search.in_place(names[i]) or places[i]
     astray = [i for i in missing if not search.is_there(places[i])]
-    moved = search.in_moved_folders([names[i] for i in astray])
+    # A folder whose images the list names as they are is no other one by another name.
+    settled = {place.parent for place in places if isinstance(place, Path) and search.is_there(place)}
+    moved = search.in_moved_folders([names[i] for i in astray], settled)
     for i, found in zip(astray, moved, strict=True):
         places[i] = found or places[i]
     # Two names for one image: whichever is wrong, none of them is certain, unless one is exact.
@@ -235,8 +237,13 @@ class _Search:
         folder = self._folder(parts[:-1]) if parts and not name.startswith("/") else None
         return None if folder is None else self._image(folder, parts[-1])
 
-    def in_moved_folders(self, names: Sequence[str]) -> list[Path | str | None]:
-        """Return the images of names whose folders are not there, from the folders that agree with these."""
+    def in_moved_folders(self, names: Sequence[str], settled: Collection[Path]) -> list[Path | str | None]:
+        """Return the images of names whose folders are not there, from the folders that agree with these.
+
+        Args:
+            names: as listed.
+            settled: folders that are none of them.
+        """
         results: list[Path | str | None] = [None] * len(names)
         groups: dict[_Key, list[int]] = {}
         for i, name in enumerate(names):
@@ -250,7 +257,7 @@ class _Search:
             found: list[list[Path | str | None]] = [
                 [self._image(folder, _parts(names[i])[-1]) for i in members]
                 for key, folder in self._folders()
-                if folder != in_place and _agree(given, key)
+                if folder != in_place and folder not in settled and _agree(given, key)
             ]
             counts = [sum(isinstance(path, Path) for path in paths) for paths in found]
             if counts and max(counts) > 0 and 2 * max(counts) >= len(members):
