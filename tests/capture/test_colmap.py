@@ -396,3 +396,11 @@ def test_names_in_the_letters_of_windows(walk, binary):
     for path in (walk.folder / "sparse" / "0").iterdir():
         path.write_bytes(path.read_bytes().replace(b"k#che", "küche".encode("cp1252")))
     check_frames(open_recording(read_colmap(walk.folder)), walk)
+
+
+def test_a_name_that_is_too_long_for_a_file_has_no_image(walk):
+    names = ("9" * 300 + ".png", "9" * 300 + "/1.png", *walk.names[2:])
+    write_colmap(replace(walk, names=names), walk.folder / "sparse" / "0", binary=True)
+    scan = open_recording(read_colmap(walk.folder))
+    check_frames(scan, walk, range(2, 12))
+    assert sorted(scan.dropped.values()) == ["no image", "no image", "no pose", "no pose"]

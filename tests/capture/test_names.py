@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import unicodedata
 
 import pytest
@@ -29,7 +30,7 @@ def found(root, *names):
     """Return where the images are, below the folder; None for those that are nowhere."""
     places = locate(names, root).places
     return [
-        place.relative_to(root).as_posix() if not isinstance(place, str) and place.is_file() else None
+        place.relative_to(root).as_posix() if not isinstance(place, str) and os.path.isfile(place) else None
         for place in places
     ]
 
@@ -93,6 +94,8 @@ def test_another_folder_is_no_other_spelling(fill):
 def test_two_folders_that_would_be_one_are_unclear(fill):
     root = fill("0.jpg", "1.jpg")
     assert found(root, "left/0.jpg", "right/0.jpg", "left/1.jpg", "right/1.jpg") == [None] * 4
+    # The list knows the folder by its own name, so it is no other one.
+    assert found(root, "left/0.jpg", "1.jpg") == [None, "1.jpg"]
     both = fill("images/0.jpg", "rgb/0.jpg", "images/1.jpg", "rgb/1.jpg")
     assert found(both / "images", "0.jpg", "1.jpg") == ["0.jpg", "1.jpg"]
 
@@ -145,3 +148,8 @@ def test_frames_get_unlike_names():
 def test_names_are_fit_for_files():
     assert frame_name("a\nb/" + 300 * "c" + ".jpg") == ("a_b_" + 300 * "c")[-120:]
     assert frame_name("frame_1305.17") == "frame_1305.17"
+
+
+def test_a_name_that_is_too_long_for_a_file_is_nowhere(fill):
+    root = fill("0.jpg")
+    assert found(root, "9" * 5000 + ".jpg", "a/" * 3000 + "0.jpg", "0.jpg") == [None, None, "0.jpg"]

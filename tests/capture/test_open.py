@@ -109,6 +109,9 @@ def test_what_is_not_there_or_unknown(walk, tmp_path):
         open_scene(walk.folder, format="kitti")
     with pytest.raises(DataError, match=r"there is no scene .*nowhere: check the path"):
         open_scene(tmp_path / "nowhere")
+    for name in ("9" * 300, "9" * 300 + ".zip"):
+        with pytest.raises(DataError, match="there is no scene"):
+            open_scene(tmp_path / name)
     with pytest.raises(DataError, match="has images without poses: let COLMAP or a phone's ARKit find them"):
         open_scene(walk.folder)
     (tmp_path / "notes.doc").write_text("")

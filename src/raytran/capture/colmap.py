@@ -237,7 +237,7 @@ def _located(path: Path, model: Path, names: list[str]) -> tuple[Path, Located]:
     folders = [base / name for base in bases for name in (*IMAGE_FOLDERS, ".") if (base / name).is_dir()]
     tried = names[:: max(1, len(names) // 8)]
     for folder in folders:
-        if any((folder / name).is_file() for name in tried if ".." not in name and "\0" not in name):
+        if any(os.path.isfile(folder / name) for name in tried if ".." not in name):
             return folder, locate(names, folder)
     candidates = [
         (folder, locate(names, folder))

@@ -18,13 +18,11 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
+from raytran.data.images import IMAGE_ENDINGS
 from raytran.data.scan import NO_POSE, numbers_first
 from raytran.errors import DataError
 
 _log = logging.getLogger(__name__)
-
-IMAGE_ENDINGS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
-"""Of the images that are read; where a name has no ending, the first of these that is there counts."""
 
 IMAGE_FOLDERS = ("images", "input", "rgb", "color", "image", "frames")
 """Folders of colour images that programs leave out of the names in their lists."""
@@ -35,7 +33,7 @@ UNCLEAR = "which image is meant is unclear"
 
 _OUTSIDE = "image is outside of the scene"
 
-_FOREIGN_ENDINGS = (".heic", ".heif", ".dng", ".exr", ".ppm", ".gif")
+_FOREIGN_ENDINGS = (".dng", ".exr", ".ppm", ".gif")
 """Endings of images that people convert to one of ``IMAGE_ENDINGS``, which keeps the rest of the name."""
 
 _MAX_FOLDERS = 1000
@@ -110,7 +108,7 @@ def unposed_images(images: Collection[Path], root: Path, taken: Collection[str])
     folders = sorted({image.parent for image in images})
     known = set(images)
     others = [
-        path for folder in folders if folder.is_dir() for path in images_in(folder) if path not in known
+        path for folder in folders if os.path.isdir(folder) for path in images_in(folder) if path not in known
     ]
     names = [frame_name(path.relative_to(os.path.abspath(root)).as_posix()) for path in others]
     return dict.fromkeys(unlike(names, taken), NO_POSE)
@@ -150,7 +148,7 @@ class Located:
     @property
     def num_found(self) -> int:
         """How many names have an image."""
-        return sum(isinstance(place, Path) and place.is_file() for place in self.places)
+        return sum(isinstance(place, Path) and os.path.isfile(place) for place in self.places)
 
     def report(self, listed_in: Path, root: Path) -> None:
         """Say how many images were found under other spellings.
@@ -183,11 +181,15 @@ def locate(names: Sequence[str], root: Path) -> Located:
     """
     search = _Search(Path(os.path.abspath(root)))
     places: list[Path | str] = [search.exact(name) for name in names]
-    missing = [i for i, place in enumerate(places) if not isinstance(place, Path) or not place.is_file()]
+    missing = [
+        i for i, place in enumerate(places) if not isinstance(place, Path) or not os.path.isfile(place)
+    ]
     for i in missing:
         places[i] = search.in_place(names[i]) or places[i]
     astray = [i for i in missing if not search.is_there(places[i])]
-    moved = search.in_moved_folders([names[i] for i in astray])
+    # A folder whose images the list names as they are is no other one by another name.
+    settled = {place.parent for place in places if isinstance(place, Path) and search.is_there(place)}
+    moved = search.in_moved_folders([names[i] for i in astray], settled)
     for i, found in zip(astray, moved, strict=True):
         places[i] = found or places[i]
     # Two names for one image: whichever is wrong, none of them is certain, unless one is exact.
@@ -227,7 +229,7 @@ class _Search:
 
     def is_there(self, place: Path | str) -> bool:
         """Whether a place is an image, or unclear for good."""
-        return place.is_file() if isinstance(place, Path) else place == UNCLEAR
+        return os.path.isfile(place) if isinstance(place, Path) else place == UNCLEAR
 
     def in_place(self, name: str) -> Path | str | None:
         """Return the image that a name means if only its spelling differs; None if there is none."""
@@ -235,8 +237,13 @@ class _Search:
         folder = self._folder(parts[:-1]) if parts and not name.startswith("/") else None
         return None if folder is None else self._image(folder, parts[-1])
 
-    def in_moved_folders(self, names: Sequence[str]) -> list[Path | str | None]:
-        """Return the images of names whose folders are not there, from the folders that agree with these."""
+    def in_moved_folders(self, names: Sequence[str], settled: Collection[Path]) -> list[Path | str | None]:
+        """Return the images of names whose folders are not there, from the folders that agree with these.
+
+        Args:
+            names: as listed.
+            settled: folders that are none of them.
+        """
         results: list[Path | str | None] = [None] * len(names)
         groups: dict[_Key, list[int]] = {}
         for i, name in enumerate(names):
@@ -250,7 +257,7 @@ class _Search:
             found: list[list[Path | str | None]] = [
                 [self._image(folder, _parts(names[i])[-1]) for i in members]
                 for key, folder in self._folders()
-                if folder != in_place and _agree(given, key)
+                if folder != in_place and folder not in settled and _agree(given, key)
             ]
             counts = [sum(isinstance(path, Path) for path in paths) for paths in found]
             if counts and max(counts) > 0 and 2 * max(counts) >= len(members):

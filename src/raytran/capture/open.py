@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -154,7 +155,7 @@ def _recognised(path: Path) -> str:
     Raises:
         DataError: it fits none; the error says what it nearly is, and what it lacks.
     """
-    if not path.exists():
+    if not os.path.exists(path):
         raise DataError(f"there is no scene {path}: check the path")
     fitting = _fitting(path)
     if len(fitting) > 1:

@@ -8,6 +8,7 @@ under the folder and nowhere else, and not more than an archive of such files ca
 from __future__ import annotations
 
 import lzma
+import os
 import struct
 import zipfile
 import zlib
@@ -18,15 +19,16 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from raytran.capture.names import IMAGE_ENDINGS, is_hidden
+from raytran.capture.names import is_hidden
 from raytran.capture.video import VIDEO_ENDINGS
+from raytran.data.images import IMAGE_ENDINGS
 from raytran.data.scan import OpenScan
 from raytran.errors import DataError
 
 PACKED_ENDINGS = (".zip", ".r3d")
 
 _WANTED = (
-    *(*IMAGE_ENDINGS, ".heic", ".heif", *VIDEO_ENDINGS),
+    *(*IMAGE_ENDINGS, *VIDEO_ENDINGS),
     *("", ".json", ".txt", ".csv", ".bin", ".tum", ".traj", ".pincam", ".sens"),
 )
 """Endings of the files that are unpacked; depth maps in formats of their own stay packed."""
@@ -46,7 +48,7 @@ _DAMAGED = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, ValueError
 
 def is_packed(path: Path) -> bool:
     """Whether a file is an archive by its ending."""
-    return path.suffix.lower() in PACKED_ENDINGS and path.is_file()
+    return path.suffix.lower() in PACKED_ENDINGS and os.path.isfile(path)
 
 
 def unpack(path: Path) -> TemporaryDirectory[str]:

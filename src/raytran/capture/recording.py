@@ -7,6 +7,7 @@ What stands at the end, for the numbers in JSON objects, trusts nothing that a f
 from __future__ import annotations
 
 import logging
+import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -278,7 +279,7 @@ def open_recording(recording: Recording) -> RecordedScan:
     turns: dict[Path, tuple[int, bool]] = {}
 
     def size_of(frame: Frame) -> tuple[int, int] | str:
-        if not frame.image.is_file():
+        if not os.path.isfile(frame.image):  # also if its name is too long to be one
             return NO_IMAGE
         try:
             header = read_header(frame.image)

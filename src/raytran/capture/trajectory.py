@@ -8,6 +8,7 @@ The layout is that of TUM RGB-D and of most SLAM programs, and Replica's as they
 from __future__ import annotations
 
 import logging
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -352,7 +353,7 @@ def read_tum(path: Path, intrinsics: Intrinsics | None = None) -> Recording:
     if not posed:
         raise DataError(f"{path} has no images: put them in its folder rgb or images")
     images = [image for image, _ in posed]
-    header = most_frequent_header([image for image in images if image.is_file()] or images)
+    header = most_frequent_header([image for image in images if os.path.isfile(image)] or images)
     lens = shared_lens(path, header.shown_size, header.size, intrinsics=intrinsics)
     has_pose = [bool(np.isfinite(pose).all()) for _, pose in posed]
     if not any(has_pose):
