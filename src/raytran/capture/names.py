@@ -18,13 +18,11 @@ from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
+from raytran.data.images import IMAGE_ENDINGS
 from raytran.data.scan import NO_POSE, numbers_first
 from raytran.errors import DataError
 
 _log = logging.getLogger(__name__)
-
-IMAGE_ENDINGS = (".jpg", ".jpeg", ".png", ".webp", ".tif", ".tiff", ".bmp")
-"""Of the images that are read; where a name has no ending, the first of these that is there counts."""
 
 IMAGE_FOLDERS = ("images", "input", "rgb", "color", "image", "frames")
 """Folders of colour images that programs leave out of the names in their lists."""
@@ -35,7 +33,7 @@ UNCLEAR = "which image is meant is unclear"
 
 _OUTSIDE = "image is outside of the scene"
 
-_FOREIGN_ENDINGS = (".heic", ".heif", ".dng", ".exr", ".ppm", ".gif")
+_FOREIGN_ENDINGS = (".dng", ".exr", ".ppm", ".gif")
 """Endings of images that people convert to one of ``IMAGE_ENDINGS``, which keeps the rest of the name."""
 
 _MAX_FOLDERS = 1000

@@ -18,15 +18,16 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from numpy.typing import NDArray
 
-from raytran.capture.names import IMAGE_ENDINGS, is_hidden
+from raytran.capture.names import is_hidden
 from raytran.capture.video import VIDEO_ENDINGS
+from raytran.data.images import IMAGE_ENDINGS
 from raytran.data.scan import OpenScan
 from raytran.errors import DataError
 
 PACKED_ENDINGS = (".zip", ".r3d")
 
 _WANTED = (
-    *(*IMAGE_ENDINGS, ".heic", ".heif", *VIDEO_ENDINGS),
+    *(*IMAGE_ENDINGS, *VIDEO_ENDINGS),
     *("", ".json", ".txt", ".csv", ".bin", ".tum", ".traj", ".pincam", ".sens"),
 )
 """Endings of the files that are unpacked; depth maps in formats of their own stay packed."""
