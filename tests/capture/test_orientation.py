@@ -25,7 +25,7 @@ from raytran.capture.orientation import (
     to_our_world,
 )
 from raytran.capture.recording import open_recording
-from raytran.data.images import turned_image
+from raytran.data.images import resize, turned_image
 from raytran.data.scannet.scan import read_scan
 from raytran.errors import ConfigError
 
@@ -273,6 +273,44 @@ def test_images_that_turn_in_all_ways_are_left_alone(scan):
     poses = torch.cat([rolled(scan, q).world_from_camera[q::4] for q in range(4)])
     mixed = replace(scan, world_from_camera=poses)
     assert rotate_upright(mixed, UP) is mixed
+
+
+@pytest.mark.parametrize("quarters", [(0, 1), (0, 2), (1, 3), (2, 3)])
+def test_a_camera_that_was_turned_on_the_way_has_each_image_turned(scan, quarters):
+    """Five frames held one way, seven another: all are upright, and show what the stored ones show."""
+    first, second = (rolled(scan, q).world_from_camera for q in quarters)
+    mixed = replace(scan, world_from_camera=torch.cat([first[:5], second[5:]]))
+    images = [np.full((48, 64, 3), 40, np.uint8) for _ in range(12)]
+    for image in images:
+        image[10:20, 40:54] = 250
+
+    def read(self, index, size, stored):
+        return images[index] if size is None else resize(images[index], size)
+
+    object.__setattr__(mixed, "images", type("", (), {"tags": None, "read": read})())
+    upright = rotate_upright(mixed, UP)
+    assert upright.image_size == ((64, 48) if quarters[1] % 2 else (48, 64))
+    assert float((-upright.world_from_camera[:, 2, 1]).min()) > 0.9
+    for n in (2, 9):
+        shown = upright.read_color(n)
+        assert shown.shape[:2] == upright.image_size
+        row, column = (value.mean() + 0.5 for value in np.nonzero(shown[..., 0] > 200))
+        ray = torch.tensor([47.0, 15.0, 1.0], dtype=torch.float64)
+        pose = mixed.world_from_camera[n]
+        point = pose[:3, :3] @ torch.linalg.inv(mixed.intrinsics[n]) @ (2 * ray) + pose[:3, 3]
+        seen, depth = upright.cameras[n].project(point[None])
+        assert seen[0].tolist() == pytest.approx([column, row], abs=0.6)
+        assert depth.item() == pytest.approx(2.0)
+        smaller = tuple(side // 2 for side in upright.image_size)
+        assert upright.read_color(n, smaller).shape[:2] == smaller
+    is_filled = (quarters[0] - quarters[1]) % 2
+    assert (upright.picture is not None) == is_filled
+    if is_filled:
+        left, top, right, bottom = upright.picture[2].tolist()
+        outside = upright.read_color(2)
+        outside[round(top) : round(bottom), round(left) : round(right)] = outside[0, 0]
+        assert (outside == outside[0, 0]).all()
+        assert upright.picture[9].tolist() == [0, 0, upright.image_size[1], upright.image_size[0]]
 
 
 DISTANCES = np.random.default_rng(0).uniform(1, 4, 200)
@@ -637,6 +675,39 @@ def test_scannets_form_may_have_intrinsics_of_shown_pictures(tmp_path, side):
     folder = write_scannet(walk, tmp_path / "stored")
     with open_scene(folder, settings=BLIND) as scan:
         same_scan(scan, poses)
+
+
+@pytest.mark.parametrize("form", ["colmap", "scannet"])
+def test_a_phone_that_was_turned_on_the_way_gives_upright_pictures_of_a_level_world(tmp_path, form):
+    """Stored by the sensor in landscape; the first ten were taken in landscape, the others upright."""
+    poses = level_walk()
+    landscape = np.arange(24) < 10
+    walk = stored_walk(tmp_path / "walk", poses, 0, with_tags=form == "colmap")
+    upright = stored_walk(tmp_path / "upright", poses, 3, with_tags=form == "colmap", size=(64, 48))
+    for n in np.flatnonzero(~landscape):
+        (walk.folder / "images" / f"{n}.png").write_bytes(
+            (upright.folder / "images" / f"{n}.png").read_bytes()
+        )
+    walk = replace(walk, poses=np.where(landscape[:, None, None], poses, upright.poses))
+    if form == "colmap":
+        write_colmap(replace(walk, poses=elsewhere(walk.poses)[0]), walk.folder / "sparse" / "0", binary=True)
+        folder = walk.folder
+    else:
+        folder = write_scannet(walk, tmp_path / "scan")
+    with open_scene(folder, settings=BLIND) as scan:
+        assert scan.image_size == (64, 48)
+        relative = scan.world_from_camera[0, :3, :3].numpy() @ poses[0, :3, :3].T
+        assert degrees_between(relative[:, 2], [0, 0, 1]) < 2
+        turned = relative @ poses[:, :3, :3]
+        np.testing.assert_allclose(scan.world_from_camera[:, :3, :3].numpy(), turned, atol=1e-6)
+        assert np.abs(scan.read_color(20).astype(int) - picture(20, (64, 48))).max() <= 2
+        assert scan.picture[20].tolist() == [0, 0, 48, 64]
+        # A landscape picture lies in the middle, three quarters as large; and so are its cameras.
+        assert scan.picture[3].tolist() == [0, 14, 48, 50]
+        inner = scan.read_color(3)[14:50].astype(int)
+        assert np.abs(inner - resize(picture(3), (36, 48))).max() <= 2
+        np.testing.assert_allclose(scan.intrinsics[3, :2, 2], [31 * 0.75, 25 * 0.75 + 14])
+        np.testing.assert_allclose(scan.intrinsics[3].diagonal(), [50 * 0.75, 51 * 0.75, 1])
 
 
 def test_a_world_that_contradicts_its_promise_is_reported_and_mended_by_a_setting(tmp_path, caplog):

@@ -25,6 +25,7 @@ from raytran.capture.doctor.matches import Matches, match_frames
 from raytran.capture.exif import described, is_shown_by_up, read_the_other_way, sides_of_up, tags_of
 from raytran.capture.frames import RawScan, read_grey
 from raytran.capture.recording import Axes
+from raytran.data.images import box_within, fill_up
 from raytran.data.scan import OpenScan
 from raytran.errors import ConfigError
 
@@ -91,6 +92,9 @@ _MIXED_TILT = 0.01
 """Mean square of the tilt of level cameras of which some lie on their side; 0.1 rad in the mean."""
 _FEWEST_MIXED = 0.15
 """Least share of those that lie on their side, and of the others; fewer do not hide which way is up."""
+
+_TWO_WAYS = 0.75
+"""Least share of the images that are held one of two ways, if each is turned by itself."""
 
 _NEARLY_SIDEWAYS = 0.2
 """Cosine between +z and the tops of cameras which look one way from which they may look steeply down."""
@@ -719,34 +723,48 @@ class RotatedScan(OpenScan):
 
     Attributes:
         stored: the scan as it is stored.
-        quarters: number of quarter turns counter-clockwise, 1 to 3.
+        quarters: number of quarter turns counter-clockwise of each image, 0 to 3.
     """
 
     stored: OpenScan
-    quarters: int
+    quarters: tuple[int, ...]
 
     @property
     def path(self) -> Path:
         """Where the stored scan lies."""
         return self.stored.path
 
-    def color_bytes(self, index: int) -> None:
-        """Return None: no frame is used as stored."""
-        return
+    def color_bytes(self, index: int) -> bytes | None:
+        """See ``OpenScan``; None for a frame that is turned."""
+        is_stored = self.quarters[index] == 0 and self.image_size == self.stored.image_size
+        return self.stored.color_bytes(index) if is_stored else None
 
     def read_color(self, index: int, image_size: tuple[int, int] | None = None) -> NDArray[np.uint8]:
         """See ``OpenScan``."""
-        if image_size is not None and self.quarters != 2:
-            image_size = (image_size[1], image_size[0])
-        return np.ascontiguousarray(np.rot90(self.stored.read_color(index, image_size), self.quarters))
+        quarters = self.quarters[index]
+        turned = _turned(self.stored.image_size, quarters)
+        fits = turned == self.image_size
+        size = None if image_size is None or not fits else _turned(image_size, quarters)
+        pixels = np.ascontiguousarray(np.rot90(self.stored.read_color(index, size), quarters))
+        if fits:
+            return pixels
+        return fill_up(pixels, box_within(turned, self.image_size), self.image_size, image_size)
 
     def close(self) -> None:
         """Close the stored scan."""
         self.stored.close()
 
 
+def _turned(size: tuple[int, int], quarters: int) -> tuple[int, int]:
+    """Return ``(H, W)`` of an image after some quarter turns."""
+    return (size[1], size[0]) if quarters % 2 else size
+
+
 def rotate_upright(scan: OpenScan, up: NDArray[np.float64]) -> OpenScan:
-    """Return the scan with its images rotated so that up in the world is up in most of them.
+    """Return the scan with its images rotated so that up in the world is up in them.
+
+    All are rotated alike, unless the camera was turned on the way: then each is, and those of another shape
+    than most are filled up.
 
     Args:
         scan: with cameras in OpenCV axes.
@@ -755,26 +773,53 @@ def rotate_upright(scan: OpenScan, up: NDArray[np.float64]) -> OpenScan:
     Returns:
         The scan itself if its images are upright, or are turned in all ways.
     """
-    # How far up points to the right and to the bottom of the images, in the mean.
-    axes = scan.world_from_camera[:, :3, :2].double().numpy()
-    right, bottom = (axes.transpose(0, 2, 1) @ up).mean(axis=0)
-    # Index of the side where up is: top, right, bottom, left.
-    quarters = int(np.argmax([-bottom, right, bottom, -right]))
-    if quarters == 0 or max(abs(right), abs(bottom)) < _SIDEWAYS:
+    quarters = _quarters_to_upright(scan.world_from_camera.double().numpy(), up)
+    if not quarters.any():
         return scan
-    cameras = scan.cameras
-    for _ in range(quarters):
-        cameras = cameras.quarter_turned()
+    turns = np.bincount(quarters, minlength=4)
+    image_size = _turned(scan.image_size, 1 if turns[1] + turns[3] > turns[0] + turns[2] else 0)
+    poses, intrinsics = scan.world_from_camera.clone(), scan.intrinsics.clone()
+    whole = torch.tensor([0.0, 0.0, image_size[1], image_size[0]], dtype=torch.float64)
+    picture = whole.repeat(len(scan), 1)
+    for turn in np.unique(quarters).tolist():
+        chosen = torch.from_numpy(quarters == turn)
+        cameras = scan.cameras[chosen]
+        for _ in range(turn):
+            cameras = cameras.quarter_turned()
+        left, top, right, bottom = box_within(cameras.image_size, image_size)
+        if cameras.image_size != image_size:
+            cameras = cameras.scaled_to((bottom - top, right - left))
+        poses[chosen], intrinsics[chosen] = cameras.world_from_camera, cameras.intrinsics
+        intrinsics[chosen, :2, 2] += torch.tensor([left, top], dtype=torch.float64)
+        shift = torch.tensor([left, top, left, top], dtype=torch.float64)
+        box = torch.tensor([0, 0, right - left, bottom - top])
+        picture[chosen] = shift + (box if cameras.picture is None else cameras.picture)
     return RotatedScan(
         scene_id=scan.scene_id,
         frame_id=scan.frame_id,
-        world_from_camera=cameras.world_from_camera,
-        intrinsics=cameras.intrinsics,
-        image_size=cameras.image_size,
-        picture=cameras.picture,
+        world_from_camera=poses,
+        intrinsics=intrinsics,
+        image_size=image_size,
+        picture=None if bool((picture == whole).all()) else picture,
         axis_alignment=scan.axis_alignment,
         dropped=scan.dropped,
         damage=scan.damage,
         stored=scan,
-        quarters=quarters,
+        quarters=tuple(quarters.tolist()),
     )
+
+
+def _quarters_to_upright(
+    world_from_camera: NDArray[np.float64], up: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """Return by how many quarter turns counter-clockwise each image becomes upright, ``(n,)``."""
+    sides = sides_of_up(world_from_camera, up)
+    share = np.bincount(sides[sides >= 0], minlength=4) / len(sides)
+    first, second, *_ = np.argsort(-share, kind="stable")
+    if share[second] > _FEWEST_MIXED and share[first] + share[second] > _TWO_WAYS:
+        return np.where(np.isin(sides, (first, second)), sides, first)
+    # How far up points to the right and to the bottom of the images, in the mean.
+    right, bottom = (world_from_camera[:, :3, :2].transpose(0, 2, 1) @ up).mean(axis=0)
+    side = int(np.argmax([-bottom, right, bottom, -right]))
+    is_clear = max(abs(right), abs(bottom)) >= _SIDEWAYS
+    return np.full(len(sides), side if is_clear else 0)
