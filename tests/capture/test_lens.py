@@ -223,6 +223,12 @@ def test_a_distortion_nobody_sees_is_not_resampled():
     [
         (replace(PLAIN, focal=(0.0, 1.0)), "no positive, finite focal lengths", "not positive and finite"),
         (replace(PLAIN, focal=(1.0, float("inf"))), "no positive, finite", "not positive and finite"),
+        (replace(PLAIN, focal=(1e-3, 1e-3)), "focal lengths of 0.001 and 0.001 pixels", "no lens has"),
+        (
+            replace(PLAIN, focal=(130.0, 1e9)),
+            "pixels for images of 160x120, as no lens has",
+            "no lens has",
+        ),
         (replace(PLAIN, center=(float("nan"), 1.0)), "no positive, finite", "not positive and finite"),
         (replace(PLAIN, center=(1e300, 1.0)), "no positive, finite", "not positive and finite"),
         (replace(PLAIN, focal=(1e-300, 1.0)), "no positive, finite", "not positive and finite"),

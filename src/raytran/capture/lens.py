@@ -33,6 +33,10 @@ _SAME_PX = 0.25
 _MAX_ZOOM = 1.5
 """Largest zoom that leaves no corner of a straightened image empty; lenses that need more are none."""
 
+_SHORTEST, _LONGEST = 0.02, 1000.0
+"""Focal lengths in widths and heights of the image between which those of lenses lie: angles of view of 175°
+and of 3 minutes of arc."""
+
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
 _PINHOLE_AT_ZERO = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION")
 """Models that are a pinhole when all their coefficients are zero."""
@@ -221,8 +225,8 @@ def check_lens(lens: Lens, where: str) -> Lens:
     Raises:
         ConfigError: it distorts and pycolmap is not installed.
         UnfitLens: sizes or focal lengths are not positive, numbers are not finite, the image is larger than
-            ``MAX_SIDE``, the principal point is farther from the middle than ``FARTHEST_CENTER``, or the
-            distortion folds the image or tears it apart.
+            ``MAX_SIDE``, focal lengths are those of no lens, the principal point is farther from the middle
+            than ``FARTHEST_CENTER``, or the distortion folds the image or moves its corners out of it.
     """
     fault = _fault(lens)
     if fault is not None:
@@ -246,6 +250,13 @@ def _fault(lens: Lens) -> tuple[str, str] | None:
             f"{{where}} is for images of {width}x{height}, and 1 to {MAX_SIDE} pixels a side are read: "
             "shrink the images, and the intrinsics with them",
             f"intrinsics for images that have not 1 to {MAX_SIDE} pixels a side",
+        )
+    fx, fy = lens.focal
+    if min(fx / width, fy / height) < _SHORTEST or max(fx / width, fy / height) > _LONGEST:
+        return (
+            f"{{where}} has focal lengths of {fx:.4g} and {fy:.4g} pixels for images of {width}x{height}, as "
+            "no lens has: calibrate it again",
+            "focal lengths that no lens has",
         )
     if center_offset(lens.center, lens.size) > FARTHEST_CENTER:
         return (
