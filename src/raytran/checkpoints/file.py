@@ -169,12 +169,20 @@ _NAME = re.compile(r"\w[\w./+-]{0,99}")
 """Names of presets and stages, which become words of a command."""
 
 
+_MAX_NAME = 150
+"""Characters of a weight's name."""
+
+
 def _is_name(value: Any) -> bool:
     return isinstance(value, str) and _NAME.fullmatch(value) is not None and ".." not in value
 
 
 def _is_object(value: Any) -> bool:
     return isinstance(value, dict) and all(isinstance(name, str) for name in value)
+
+
+def _is_state(value: Any) -> bool:
+    return _is_object(value) and all(len(name) <= _MAX_NAME and name.isprintable() for name in value)
 
 
 def _is_texts(value: Any) -> bool:
@@ -207,7 +215,7 @@ _REQUIRED: dict[str, Callable[[Any], bool]] = {
     "preset": _is_name,
     "model": _is_object,
     "views": _is_object,
-    "state_dict": _is_object,
+    "state_dict": _is_state,
 }
 _OPTIONAL: dict[str, Callable[[Any], bool]] = {
     "config": _is_object,

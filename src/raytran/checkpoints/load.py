@@ -14,7 +14,7 @@ from raytran.checkpoints.file import PREFIX, checkpoint_path, read_checkpoint
 from raytran.checkpoints.metadata import input_mask
 from raytran.checkpoints.network import build_network
 from raytran.errors import CheckpointError, DataError
-from raytran.limits import MAX_VIEWS, SIDE, as_count, as_numbers, shown
+from raytran.limits import MAX_VIEWS, SIDE, as_count, as_numbers
 from raytran.model import RayTran
 from raytran.ops.traverse import Attention, RayTracer
 
@@ -135,7 +135,7 @@ def load_weights(
     for name, value in state.items():
         if value.is_floating_point() and not _in_float32(value).isfinite().all():
             raise CheckpointError(
-                f"{shown(name)} in {path} is not finite: take a checkpoint from before the training diverged"
+                f"{PREFIX}{name} in {path} is not finite: take a checkpoint from before the training diverged"
             )
     state |= {name: value for name, value in model.state_dict().items() if name.startswith(kept)}
     try:
