@@ -127,7 +127,7 @@ class FrameList:
         try:
             yield
         except DataError as error:
-            self.dropped[name] = reason
+            self.dropped[name] = error.reason if isinstance(error, UnfitLens) else reason
             self._first = self._first or error
 
     def checked(self) -> tuple[Frame, ...]:

@@ -10,7 +10,7 @@ import struct
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from io import BytesIO
@@ -507,7 +507,8 @@ def most_frequent_header(
     if counts:
         return counts.most_common(1)[0][0]
     if paths and paths[0].is_file():
-        read_header(paths[0])  # It may say why.
+        with suppress(*UNREADABLE):
+            _header(paths[0])  # It may say why.
     raise DataError(f"no image in {paths[0].parent} can be read: copy or export them again")
 
 
