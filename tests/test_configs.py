@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import inspect
+import re
 from datetime import timedelta
 
 import pytest
@@ -240,3 +242,57 @@ def test_switches_are_read():
         "auto",
         "none",
     )
+
+
+def settings_of_all_commands(project_root):
+    """Return all settings, dotted, of all commands with all that can be chosen, and the groups of choices."""
+    chosen = {
+        "predict": [[]],
+        "prepare": [[]],
+        "export_model": [[]],
+        "view": [[]],
+        "demo": [[]],
+        "plan": [[]],
+    }
+    chosen |= {"evaluate": [[]], "curriculum": [[]]}
+    chosen["train"] = [
+        [
+            "preset=tiny",
+            "logger=many",
+            "debug=profiler",
+            "model/extensions=[unet3d,denoising,box_refinement]",
+        ],
+        ["preset=laptop", "data=scan2cad", "experiment=novel_view"],
+    ]
+    known = {str(path.relative_to(project_root / "conf")) for path in (project_root / "conf").rglob("*")}
+
+    def dotted(node, prefix=""):
+        for key, value in node.items():
+            known.add(f"{prefix}{key}")
+            if isinstance(value, dict):
+                dotted(value, f"{prefix}{key}.")
+
+    for command, several in chosen.items():
+        for typed in several:
+            dotted(OmegaConf.to_container(compose(command, typed)))
+    return known
+
+
+def test_settings_that_messages_name_are_settings(project_root):
+    """An advice that names a setting can be typed; only ``unknown KEY=VALUE`` may say the last part alone."""
+    known = settings_of_all_commands(project_root)
+    last_parts = {name.rpartition(".")[2] for name in known}
+    found = 0
+    for path in sorted((project_root / "src" / "raytran").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if not isinstance(node, ast.Call):
+                continue
+            name = getattr(node.func, "id", getattr(node.func, "attr", ""))
+            if not (name.endswith("Error") or name in ("info", "warning", "error")) or not node.args:
+                continue
+            text = ast.unparse(node.args[0])
+            for before, key in re.findall(r"(unknown )?(?<![\w./}-])([a-z_][\w./]*)=(?!=)", text):
+                found += 1
+                is_known = key in known or (before and key in last_parts) or key == "key"
+                assert is_known, f"{path}:{node.lineno}: there is no setting {key}"
+    assert found > 120

@@ -13,6 +13,7 @@ from torch import Tensor
 from raytran.extensions.unprojection import pair_centers
 from raytran.geometry.boxes import OrientedBoxes, box_iou
 from raytran.geometry.camera import Cameras
+from raytran.geometry.checks import check_views, rigid_motions
 from raytran.geometry.grid import VoxelGrid, position_code, ray_code
 from raytran.geometry.rasterize import rasterize_mask
 from raytran.geometry.room_tiles import Volumes, cover
@@ -33,9 +34,9 @@ from raytran.ops import reference
 from raytran.ops.pairs import PairList
 from raytran.ops.ray_attention import ray_attention
 from raytran.ops.splat import splat_features
-from raytran.ops.traverse import count_views, trace_pairs
+from raytran.ops.traverse import count_views, trace_pairs, voxel_rays
 from raytran.postprocess import count_object_views, merge_volumes, object_meshes, select_objects
-from raytran.structs import ObjectSet, ScenePrediction
+from raytran.structs import ObjectSet, ScenePrediction, Views
 from raytran.viewer.attention import attention_weights
 
 from .pretend_device import DEVICE, on_pretend_device, recorded
@@ -73,6 +74,15 @@ class Inputs:
         pose[..., :3, 3] = torch.linspace(0, 0.5, lead[-1])[:, None]
         intrinsics = torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]]).repeat(*lead, 1, 1)
         return Cameras(intrinsics.to(self._device), pose.to(self._device), (32, 48))
+
+    def in_pictures(self, *lead: int) -> Cameras:
+        """The same cameras, which took less than their images."""
+        picture = torch.tensor([9.0, 0, 31, 32]).repeat(*lead, 1).to(self._device)
+        return replace(self.cameras(*lead), picture=picture)
+
+    def views(self) -> Views:
+        cameras, images = self.in_pictures(1, 2), self.random(1, 2, 3, 32, 48)
+        return Views(images, cameras.intrinsics, cameras.world_from_camera, cameras.picture)
 
     def grid(self, *lead: int) -> VoxelGrid:
         return VoxelGrid(RESOLUTION, EXTENT, torch.zeros(*lead, 3).to(self._device))
@@ -137,6 +147,12 @@ FUNCTIONS = {
     "cover": covered,
     "trace_pairs": lambda at: at.pairs().voxel_index,
     "trace_pairs's twin": lambda at: reference.trace_pairs(at.cameras(2), at.grid(), (2, 3)).voxel_index,
+    "trace_pairs of pictures": lambda at: trace_pairs(at.in_pictures(2), at.grid(), (2, 3)).voxel_index,
+    "cells_in_picture": lambda at: at.in_pictures(2).cells_in_picture((2, 3), 2),
+    "sees": lambda at: at.in_pictures(2).sees(*at.cameras(2).project(at.boxes().center)),
+    "quarter_turned": lambda at: at.in_pictures(2).quarter_turned().intrinsics,
+    "rigid_motions": lambda at: rigid_motions(at.cameras(2).world_from_camera),
+    "check_views": lambda at: check_views(at.views()) is None,
     "pair_centers": lambda at: pair_centers(at.cameras(1, 2), at.grid(1), (2, 3)).voxel_index,
     "count_views": lambda at: count_views(at.cameras(2), at.grid(), (2, 3)),
     "blocks": lambda at: PairList.from_blocks(at.pairs().blocks()).by("voxels"),
@@ -232,6 +248,25 @@ def test_views_of_objects_are_counted_without_a_wait():
     with recorded() as seen:
         count_object_views(scene, grid_extent=EXTENT)
     assert not seen.waits, seen
+
+
+@on_pretend_device
+def test_rays_outside_of_pictures_are_left_out_without_a_wait():
+    waits = []
+    for cameras in (Inputs(DEVICE).cameras(2), Inputs(DEVICE).in_pictures(2)):
+        with recorded() as seen:
+            voxel_rays(cameras, Inputs(DEVICE).grid(), (2, 3), 2)
+        waits.append(seen.waits)
+    assert waits[0] == waits[1]
+
+
+@on_pretend_device
+def test_the_values_of_views_are_waited_for_once():
+    views = Inputs(DEVICE).views()
+    for values, expected in ((True, 1), (False, 0)):
+        with recorded() as seen:
+            check_views(views, values=values)
+        assert seen.waits.total() == expected, seen
 
 
 def calls_of(root, folders):

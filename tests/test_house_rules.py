@@ -34,3 +34,19 @@ def test_every_file_names_its_licence(project_root):
     for folder in ("src", "tests", "benchmarks"):
         for path in (project_root / folder).rglob("*.py"):
             assert path.read_text().startswith("# SPDX-License-Identifier: Apache-2.0\n"), path
+
+
+def test_files_reach_pillow_in_one_place(project_root):
+    """``open_image`` looks at a file's first bytes; Pillow alone would start Ghostscript for some."""
+    for path, _, tree in parsed_sources(project_root):
+        opens = [
+            node.lineno
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Attribute) and node.attr in ("open", "imread") and _is_pillow(node.value)
+        ]
+        if path.parts[-2:] != ("data", "images.py"):
+            assert not opens, f"{path}:{opens}: open images by raytran.data.images.open_image"
+
+
+def _is_pillow(node):
+    return isinstance(node, ast.Name) and node.id in ("Image", "imageio", "cv2")

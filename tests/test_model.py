@@ -7,9 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
-from raytran.errors import ConfigError, ShapeError
+from raytran.errors import ConfigError, DataError, ShapeError
 from raytran.extensions.denoising import DenoisingLoss
 from raytran.geometry.camera import Cameras
+from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.rotation import yaw_from_rotation
 from raytran.losses.matcher import HungarianMatcher
 from raytran.losses.total import TotalLoss
@@ -296,3 +297,58 @@ def test_what_rendering_needs_is_said() -> None:
     del model.heads["view"]
     with pytest.raises(ConfigError, match="train experiment=novel_view"):
         next(model.render(views, Cameras.of(views)))
+
+
+def test_a_prediction_checks_its_views_unless_told_not_to() -> None:
+    """As commands check those of files: one sentence that names the view, and no numbers."""
+    model, views = make_model(), make_views()
+    pose, matrix = views.world_from_camera.clone(), views.intrinsics.clone()
+    pose[0, 1, 0, 3], matrix[0, 1, 0, 0] = float("nan"), float("inf")
+    colors = views.images / 255
+    colors[0, 1, 2, 3, 4] = float("nan")
+    for spoiled, fault in (
+        (replace(views, world_from_camera=pose), "a pose that is not finite"),
+        (replace(views, intrinsics=matrix), "intrinsics that are not finite"),
+        (replace(views, images=colors), "colours that are no numbers"),
+    ):
+        with pytest.raises(DataError, match=f"^view 1 has {fault}"):
+            model.predict(spoiled)
+        with pytest.raises(DataError, match=f"^view 1 has {fault}"):
+            next(model.render(spoiled, Cameras.of(views)))
+        assert model.predict(spoiled, check=False, with_shapes=False).scene_id == ""
+    with pytest.raises(ShapeError, match=r"images of shape \(1, N, 3, H, W\)"):
+        model.predict(make_views(scenes=2), check=False)
+    with pytest.raises(DataError, match=r"grid_center=\[0.0, nan, 0.0\] is no place"):
+        model.predict(views, grid_center=torch.tensor([0.0, float("nan"), 0.0]))
+    with pytest.raises(ShapeError, match="grid_center of shape"):
+        model.predict(views, grid_center=torch.zeros(1, 3))
+
+
+def test_cameras_of_numpy_give_the_same_as_those_of_files() -> None:
+    """Poses that numpy computed are of float64; commands bring them to float32."""
+    model, views = make_model(), make_views()
+    precise = replace(
+        views, intrinsics=views.intrinsics.double(), world_from_camera=views.world_from_camera.double()
+    )
+    expected, found = (model.predict(some, with_shapes=False).objects for some in (views, precise))
+    assert torch.equal(found.center, expected.center)
+
+
+def test_what_fills_an_image_up_is_read_by_no_voxel() -> None:
+    """A frame 16 wide in an image of 48: no pair joins a voxel with what lies beside it."""
+    model, views = make_model().eval(), make_views(views=3)
+    picture = torch.tensor([16.0, 0.0, 32.0, 32.0]).expand(1, 3, 4)
+    part = replace(views, picture=picture)
+    grid = VoxelGrid(model.grid_resolution, model.grid_extent, torch.zeros(1, 3))
+    pairs = model.trace(Cameras.of(part), grid)
+    assert set((pairs.pixel_index % 3).tolist()) == {1}
+    seen, whole = (model.predict(some, with_shapes=False).seen for some in (part, views))
+    assert 0 < seen.sum() < whole.sum()
+    assert (seen <= whole).all()
+    together, apart = model.predict(part), model.predict(part, views_at_once=2)
+    assert torch.equal(together.seen, apart.seen)
+    torch.testing.assert_close(together.occupancy, apart.occupancy, rtol=1e-5, atol=1e-6)
+    everything = replace(views, picture=torch.tensor([0.0, 0, 48, 32]).expand(1, 3, 4))
+    expected, found = (model.predict(some, with_shapes=False) for some in (views, everything))
+    assert torch.equal(found.occupancy, expected.occupancy)
+    assert torch.equal(found.seen, expected.seen)

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 import torch
 
+from raytran import postprocess
+from raytran.geometry.boxes import OrientedBoxes, box_iou
 from raytran.geometry.room_tiles import Volumes
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.postprocess import count_object_views, merge_volumes, object_meshes, select_objects
@@ -192,3 +194,26 @@ def test_voxels_come_from_the_volume_whose_middle_is_nearest():
     assert seen.shape == (14, 14, 4)
     assert seen[:6, 8:].sum() == 0
     assert seen.sum() == (14 * 14 - 6 * 6) * 4
+
+
+def test_memory_grows_with_objects_not_with_their_square(monkeypatch):
+    largest = []
+
+    def iou(first, second):
+        largest.append(len(first.center) * len(second.center))
+        return box_iou(first, second)
+
+    monkeypatch.setattr(postprocess, "box_iou", iou)
+    count = 1500
+    center = torch.rand(count, 3, generator=torch.Generator().manual_seed(0)) * 12
+    scene = prediction([5] * count, center.tolist(), torch.linspace(1, 0.5, count).tolist())
+    kept = select_objects(scene, duplicate_iou=0.1).objects
+    assert max(largest) <= 256 * count
+    # The objects that are kept, one after another, by the table of all pairs.
+    boxes = OrientedBoxes(scene.objects.center, scene.objects.size, scene.objects.rotation)
+    table, expected = box_iou(boxes, boxes)[0] > 0.1, []
+    for index in range(count):
+        if not table[index, expected].any():
+            expected.append(index)
+    assert torch.equal(kept.center, scene.objects.center[expected])
+    assert len(expected) < count - 100

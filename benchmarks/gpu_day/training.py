@@ -20,7 +20,8 @@ import torch
 from gpu_day.context import Context
 from raytran.checkpoints.file import read_newest
 from raytran.checkpoints.runs import LAST, read_finished
-from raytran.run.entry import compose, quoted
+from raytran.run.entry import compose
+from raytran.run.path_settings import quoted
 from raytran.run.train.build import build_data
 from raytran.training.loggers import read_history
 

@@ -3,14 +3,40 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 
+LONGEST = 290
+"""Characters of an error's sentence; with the program's name before it 300 at most."""
+
+_KEPT_OF_WORDS = (40, 20)
+"""Characters that the longest words keep: so many first, so many if that does not do."""
+
+_FROM_A_WORKER = re.compile(r"Caught \w+ in DataLoader worker process \d+\.\n")
+
+
 class RaytranError(Exception):
-    """Base of all errors that are the user's to mend; commands print it as one sentence and exit with 1."""
+    """Base of all errors that are the user's to mend; commands print it as one sentence and exit with 1.
+
+    Its ``str`` is one line of at most ``LONGEST`` characters, whatever a file or a command line has put into
+    it; ``args`` hold what was given.
+
+    A loader makes an error of one of its worker processes anew, with the worker's traceback as the message:
+    what counts is the sentence at the end of that.
+    """
+
+    def __init__(self, message: object = "") -> None:
+        text = str(message)
+        if _FROM_A_WORKER.match(text):
+            text = text.rstrip().splitlines()[-1].partition(": ")[2] or text
+        super().__init__(text)
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
 
 
 class ConfigError(RaytranError):
@@ -31,6 +57,41 @@ class NonFiniteError(RaytranError):
 
 class ShapeError(RaytranError, ValueError):
     """A tensor does not have the documented shape."""
+
+
+def one_line(text: str, longest: int = LONGEST) -> str:
+    """Return a sentence in printable characters on one line, cut in the middle where it is too long.
+
+    What cannot be printed is written by its number, as in a literal of Python. The longest words, which are
+    paths and values, give way first, so that the reason at the front and the remedy at the end stay.
+
+    Args:
+        text: the sentence.
+        longest: most characters.
+    """
+    text = _printable(_middle_cut(text, 40 * longest).strip())  # what is far too long is not looked through
+    if len(text) <= longest:
+        return text
+    words = text.split(" ")
+    too_many = len(text) - longest
+    for kept in _KEPT_OF_WORDS:
+        while too_many > 0 and len(word := max(words, key=len)) > kept:
+            cut = _middle_cut(word, max(kept, len(word) - too_many))
+            words[words.index(word)] = cut
+            too_many -= len(word) - len(cut)
+    return _middle_cut(" ".join(words), longest)
+
+
+def _printable(text: str) -> str:
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def _middle_cut(text: str, length: int) -> str:
+    if len(text) <= length:
+        return text
+    return f"{text[: length // 2]}…{text[len(text) - (length - length // 2 - 1) :]}"
 
 
 def check_shape(tensor: Tensor, letters: str, name: str) -> None:

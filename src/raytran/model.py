@@ -16,8 +16,9 @@ import torch
 from torch import Tensor, nn
 
 from raytran.backbone.backbone import VoxelBackbone
-from raytran.errors import ConfigError, ShapeError
+from raytran.errors import ConfigError, DataError, ShapeError, check_shape
 from raytran.geometry.camera import Cameras
+from raytran.geometry.checks import check_views
 from raytran.geometry.grid import VoxelGrid, checked_grid
 from raytran.heads.objects import ObjectOutputs, objects_of_queries
 from raytran.ops.pairs import Pairs
@@ -195,6 +196,7 @@ class RayTran(nn.Module):
         with_shapes: bool = True,
         views_at_once: int | None = None,
         grid_center: Tensor | None = None,
+        check: bool = True,
     ) -> ScenePrediction:
         """Predict one scene (B = 1), counting the views of each voxel. Puts the network in eval mode.
 
@@ -206,9 +208,18 @@ class RayTran(nn.Module):
             views_at_once: views that pass through the network together, None for all; the same result up to
                 rounding in less memory.
             grid_center: ``(3,)`` centre of the voxel grid, metres; by default the mean camera position.
+            check: check the values in the tensors, as the commands do with those of files. On a GPU the host
+                waits for that once, so leave it out where frames were checked before; types and shapes are
+                checked in any case.
+
+        Raises:
+            ConfigError: ``views_at_once`` is not positive.
+            DataError: views hold what no camera gives; the message names the first of them (``check_views``).
+            ShapeError: a tensor does not have the documented shape.
         """
         self.eval()
-        center = None if grid_center is None else grid_center[None]
+        views = self._checked(views, grid_center, check)
+        center = None if grid_center is None else grid_center[None].float()
         raw = self(views, views_at_once=views_at_once, grid_center=center)
         found = self.decode(raw, [scene_id], score_threshold=score_threshold, with_shapes=with_shapes)[0]
         return replace(found, seen=self._count_views(views, found.grid_center))
@@ -221,6 +232,7 @@ class RayTran(nn.Module):
         *,
         views_at_once: int | None = None,
         grid_center: Tensor | None = None,
+        check: bool = True,
     ) -> Iterator[Tensor]:
         """Render one scene (B = 1) from new cameras, a few at a time. Puts the network in eval mode.
 
@@ -230,15 +242,18 @@ class RayTran(nn.Module):
                 encoder's stride.
             views_at_once: views, old or new, that pass through the network together, None for all.
             grid_center: ``(3,)`` centre of the voxel grid, metres; None: the mean camera position.
+            check: as of ``predict``.
 
         Yields:
             ``(n, 3, H, W)`` red, green and blue in [0, 1] of the next cameras.
 
         Raises:
             ConfigError: the network has no view head.
+            DataError, ShapeError: as from ``predict``.
         """
         self.eval()
-        center = Cameras.of(views).position.mean(dim=1) if grid_center is None else grid_center[None]
+        views = self._checked(views, grid_center, check)
+        center = Cameras.of(views).position.mean(dim=1) if grid_center is None else grid_center[None].float()
         grid = VoxelGrid(self.grid_resolution, self.grid_extent, center)
         voxels, _ = self._run_backbone(views, grid, False, views_at_once)
         count = cameras.intrinsics.shape[1]
@@ -267,6 +282,19 @@ class RayTran(nn.Module):
             )
             for scene, scene_id in enumerate(scene_ids)
         )
+
+    def _checked(self, views: Views, grid_center: Tensor | None, values: bool) -> Views:
+        """Return the views of one scene in float32; raise unless they are such as the commands give."""
+        check_views(views, channels=self.backbone.encoder.input_channels, values=values)
+        if grid_center is not None:
+            check_shape(grid_center, "3", "grid_center")
+            if values and not bool(grid_center.isfinite().all()):
+                raise DataError(
+                    f"grid_center={grid_center.tolist()} is no place: give three numbers in metres"
+                )
+        images = views.images.float() if views.images.is_floating_point() else views.images
+        cameras = Cameras.of(views).to(torch.float32)
+        return Views(images, cameras.intrinsics, cameras.world_from_camera, cameras.picture)
 
     def _count_views(self, views: Views, grid_center: Tensor) -> Tensor:
         cameras = Cameras.of(views.scene())

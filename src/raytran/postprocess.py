@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -32,6 +32,9 @@ _POINTS_PER_SIDE = 4
 _SAME_IOU, _SAME_PLACE_IOU = 0.25, 0.5
 """Objects of two volumes whose boxes overlap by more than this IoU are one: the first if they are of one
 class, the second whatever they are."""
+
+_OBJECTS_AT_ONCE = 256
+"""Objects that are compared with all others together, so that memory grows with their number."""
 
 _NEARLY_OWN = 0.25
 """How far on another volume's side of the border an object still counts, if nothing else is there, metres."""
@@ -66,20 +69,39 @@ def select_objects(
 
 def _first_of_duplicates(objects: ObjectSet, duplicate_iou: float) -> Tensor:
     """Return which objects are no duplicates of an earlier one that is kept, ``(K,)`` int64."""
-    boxes = OrientedBoxes(objects.center, objects.size, objects.rotation)
-    duplicates = (box_iou(boxes, boxes)[0] > duplicate_iou) & (objects.label[:, None] == objects.label)
-    return _first_of(duplicates)
+
+    def duplicates(some: slice, others: slice) -> Tensor:
+        same_class = objects.label[some, None] == objects.label[others]
+        return (_iou(objects, some, others) > duplicate_iou) & same_class
+
+    return _first_of(objects, duplicates)
 
 
-def _first_of(duplicates: Tensor) -> Tensor:
-    """Return which have no duplicate among those kept before them: ``(M, M)`` bool → ``(K,)`` int64."""
-    # Each depends on those before: gone through on the host, so that a GPU is waited for once.
-    of_earlier = duplicates.cpu().numpy()
+def _iou(objects: ObjectSet, some: slice, others: slice) -> Tensor:
+    """Return the IoU of some of the boxes with others of them, ``(A, B)``."""
+    first, second = (
+        OrientedBoxes(objects.center[part], objects.size[part], objects.rotation[part])
+        for part in (some, others)
+    )
+    return box_iou(first, second)[0]
+
+
+def _first_of(objects: ObjectSet, duplicates: Callable[[slice, slice], Tensor]) -> Tensor:
+    """Return which objects have no duplicate among those kept before them, ``(K,)`` int64.
+
+    Args:
+        objects: M objects.
+        duplicates: says which of some objects are the same as which others, ``(A, B)`` bool.
+    """
     kept: list[int] = []
-    for index, row in enumerate(of_earlier):
-        if not row[kept].any():
-            kept.append(index)
-    return torch.tensor(kept, dtype=torch.int64, device=duplicates.device)
+    for start in range(0, len(objects), _OBJECTS_AT_ONCE):
+        stop = min(start + _OBJECTS_AT_ONCE, len(objects))
+        # Each depends on those before: gone through on the host, so that a GPU is waited for once.
+        of_earlier = duplicates(slice(start, stop), slice(stop)).cpu().numpy()
+        for index, row in enumerate(of_earlier, start=start):
+            if not row[kept].any():
+                kept.append(index)
+    return torch.tensor(kept, dtype=torch.int64, device=objects.label.device)
 
 
 def count_object_views(prediction: ScenePrediction, *, grid_extent: tuple[float, float, float]) -> ObjectSet:
@@ -133,7 +155,14 @@ def merge_volumes(predictions: Sequence[ScenePrediction], volumes: Volumes) -> S
     order = torch.argsort(objects.score + 2 * owned, descending=True, stable=True)
     order = order[candidate[order]]
     objects, volume = objects.select(order), volume[order]
-    objects = objects.select(_first_of(_same_thing(objects) & (volume[:, None] != volume)))
+
+    def same_thing(some: slice, others: slice) -> Tensor:
+        iou = _iou(objects, some, others)
+        same_class = objects.label[some, None] == objects.label[others]
+        alike = same_class & (iou > _SAME_IOU) | (iou > _SAME_PLACE_IOU)
+        return alike & (volume[some, None] != volume[others])
+
+    objects = objects.select(_first_of(objects, same_thing))
     return ScenePrediction(
         scene_id=predictions[0].scene_id,
         objects=objects.select(objects.score.argsort(descending=True, stable=True)),
@@ -141,14 +170,6 @@ def merge_volumes(predictions: Sequence[ScenePrediction], volumes: Volumes) -> S
         occupancy=_join_voxels([prediction.occupancy for prediction in predictions], volumes),
         seen=_join_voxels([prediction.seen for prediction in predictions], volumes),
     )
-
-
-def _same_thing(objects: ObjectSet) -> Tensor:
-    """Return which objects of different volumes are one and the same, ``(M, M)`` bool."""
-    boxes = OrientedBoxes(objects.center, objects.size, objects.rotation)
-    iou, _ = box_iou(boxes, boxes)
-    same_class = objects.label[:, None] == objects.label
-    return same_class & (iou > _SAME_IOU) | (iou > _SAME_PLACE_IOU)
 
 
 def _join(parts: Sequence[ObjectSet]) -> ObjectSet:

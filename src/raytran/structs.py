@@ -124,11 +124,14 @@ class Views(TensorStruct):
             channel is a foreground mask given as input (RayTran §4, "Perfect segmentation").
         intrinsics: ``(B, N, 3, 3)`` camera matrices for images of size ``H × W``, in pixels.
         world_from_camera: ``(B, N, 4, 4)`` poses.
+        picture: ``(B, N, 4)`` left, top, right and bottom of what the camera took within each image, pixels;
+            around it the image is filled up and nothing is read there. None: every image is all picture.
     """
 
     images: Tensor
     intrinsics: Tensor
     world_from_camera: Tensor
+    picture: Tensor | None = None
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -141,11 +144,15 @@ class Views(TensorStruct):
         Args:
             frames: which, a slice or an int64 or bool tensor over N.
         """
-        return Views(self.images[:, frames], self.intrinsics[:, frames], self.world_from_camera[:, frames])
+        picture = None if self.picture is None else self.picture[:, frames]
+        return Views(
+            self.images[:, frames], self.intrinsics[:, frames], self.world_from_camera[:, frames], picture
+        )
 
     def scene(self, index: int = 0) -> Views:
         """Return the views of one scene, without the leading dimension: images are ``(N, 3 or 4, H, W)``."""
-        return Views(self.images[index], self.intrinsics[index], self.world_from_camera[index])
+        picture = None if self.picture is None else self.picture[index]
+        return Views(self.images[index], self.intrinsics[index], self.world_from_camera[index], picture)
 
     def colors(self) -> Tensor:
         """Return red, green and blue in [0, 1], ``(B, N, 3, H, W)`` in floating point."""

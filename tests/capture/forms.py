@@ -6,15 +6,22 @@ from __future__ import annotations
 import json
 import struct
 from dataclasses import dataclass
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+DISPLAY_MATRICES = {2: (-1, 0, 0, 1), 3: (-1, 0, 0, -1), 4: (1, 0, 0, -1), 6: (0, 1, -1, 0), 8: (0, -1, 1, 0)}
+"""EXIF orientation → where the display matrix of a video takes the axes of its picture."""
+
 SCAN = "scene0000_00"
 """The scan in the room of the tests."""
 
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+Y_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""The +y up world of ARKit from the walk's."""
+
 MODEL_NUMBERS = {
     "PINHOLE": 1,
     "SIMPLE_RADIAL": 2,
@@ -110,8 +117,17 @@ def write_tum(walk: Walk, folder: Path, times, image_times=None) -> None:
     (folder / "intrinsics.txt").write_text(words(walk.camera))
 
 
-def write_video(walk: Walk, path: Path, *, rate: int = 10, size=None) -> None:
-    """Encode the walk's images as a video without loss of a grey level, with a frame every 1 / rate s."""
+def write_video(walk: Walk, path: Path, *, rate: int = 10, size=None, turn: int = 1, times=None) -> None:
+    """Encode the walk's images as a video without loss of a grey level, with a frame every 1 / rate s.
+
+    Args:
+        walk: with its images.
+        path: of the video.
+        rate: frames a second.
+        size: ``(H, W)`` that is coded; None: the images'.
+        turn: EXIF orientation by which the frames, coded as its images are, are to be displayed.
+        times: of the frames, milliseconds, instead of the rate.
+    """
     import av
     from PIL import Image
 
@@ -119,10 +135,43 @@ def write_video(walk: Walk, path: Path, *, rate: int = 10, size=None) -> None:
         stream = container.add_stream("libx264", rate=rate, options={"crf": "4", "g": "5", "bf": "2"})
         stream.height, stream.width = size or walk.image_size
         stream.pix_fmt = "yuv420p"
-        for name in walk.names:
+        if times is not None:
+            stream.codec_context.time_base = Fraction(1, 1000)
+        for n, name in enumerate(walk.names):
             with Image.open(walk.folder / "images" / name) as image:
-                container.mux(stream.encode(av.VideoFrame.from_image(image.convert("RGB"))))
+                frame = av.VideoFrame.from_image(image.convert("RGB"))
+            if times is not None:
+                frame.pts, frame.time_base = int(times[n]), Fraction(1, 1000)
+            container.mux(stream.encode(frame))
         container.mux(stream.encode())
+    if turn != 1:
+        content = bytearray(path.read_bytes())
+        at = content.find(b"tkhd") + 44
+        a, b, c, d = (value << 16 for value in DISPLAY_MATRICES[turn])
+        struct.pack_into(">9i", content, at, a, b, 0, c, d, 0, 0, 0, 1 << 30)
+        path.write_bytes(content)
+
+
+def write_stray(walk: Walk, folder: Path) -> Path:
+    """Write ``odometry.csv``, ``camera_matrix.csv`` and ``rgb/`` as Stray Scanner does, in ARKit's world."""
+    (folder / "rgb").mkdir(parents=True)
+    fx, fy, cx, cy = walk.camera
+    (folder / "camera_matrix.csv").write_text(f"{fx}, 0, {cx}\n0, {fy}, {cy}\n0, 0, 1\n")
+    rows = ["timestamp, frame, x, y, z, qx, qy, qz, qw"]
+    for n, (name, pose) in enumerate(zip(walk.names, Y_UP @ walk.poses, strict=True)):
+        turn = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        rows.append(", ".join([str(n / 60), f"{n:06d}", *words([*pose[:3, 3], *turn]).split()]))
+        (folder / "rgb" / f"{n:06d}.png").write_bytes((walk.folder / "images" / name).read_bytes())
+    (folder / "odometry.csv").write_text("\n".join(rows) + "\n")
+    return folder
+
+
+def check_frames(scan, walk: Walk, numbers=None, *, turn=None) -> None:
+    """Hold the poses of a scan against the walk's, by the grey of each image, which tells its number."""
+    found = [round(float(scan.read_color(i)[24, 32, 0]) / 20) for i in range(len(scan))]
+    assert sorted(found) == sorted(range(len(walk.names)) if numbers is None else numbers)
+    poses = walk.poses[found] if turn is None else turn @ walk.poses[found]
+    np.testing.assert_allclose(scan.world_from_camera.numpy(), poses, atol=1e-6)
 
 
 def words(values) -> str:

@@ -9,9 +9,11 @@ from PIL import Image
 from scipy import ndimage
 
 from raytran.capture.frames import RawScan, blurred_frames, read_grey, sharpness
+from raytran.capture.nerfstudio import read_nerfstudio
+from raytran.capture.recording import open_recording
 from raytran.data.scannet.scan import read_scan
 
-from .forms import SCAN
+from .forms import SCAN, transforms, write_transforms
 
 
 def test_grey_images_are_scaled_down_but_never_up(raw):
@@ -69,3 +71,19 @@ def test_no_frame_of_a_steady_real_scan_is_blurred(shared_dir):
     folder = next((shared_dir / "realdata" / "scene0470_00").rglob("color")).parent
     with read_scan(folder) as scan:
         assert not blurred_frames(scan, range(0, len(scan), 6)).any()
+
+
+def test_blur_is_measured_in_the_picture_alone(walk):
+    """A narrow frame shows as much detail as the others, beside what fills its image up."""
+    rng = np.random.default_rng(0)
+    frames = transforms(walk)["frames"]
+    for n in range(12):
+        size = (16, 3) if n == 5 else (12, 16)
+        blocks = rng.integers(100, 150, size, dtype=np.uint8).repeat(4, axis=0).repeat(4, axis=1)
+        Image.fromarray(blocks).save(walk.folder / "images" / f"{n}.png")
+    Image.new("RGB", (12, 64), (124, 116, 104)).save(walk.folder / "images" / "7.png")
+    for n in (5, 7):
+        frames[11 - n] |= {"w": 12, "h": 64, "cx": 6, "cy": 31}
+    scan = open_recording(read_nerfstudio(write_transforms(walk, frames=frames)))
+    assert scan.picture is not None
+    assert np.flatnonzero(blurred_frames(scan, range(12))).tolist() == [7]

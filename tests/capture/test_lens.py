@@ -6,20 +6,21 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from raytran.capture.lens import (
     Lens,
+    UnfitLens,
+    center_fault,
     check_lens,
     colmap_lens,
     load_pycolmap,
     needs_resampling,
     opencv_lens,
+    pinhole_of,
     resample,
-    shared_pinhole,
 )
 from raytran.errors import ConfigError, DataError
 
@@ -127,7 +128,7 @@ def test_every_model_of_pycolmap_is_read_by_name_and_number():
         lens = colmap_lens(name, (120, 160), params, "camera 1")
         assert lens == colmap_lens(int(model.value), (120, 160), params, "camera 1")
         assert lens.center == (80, 60)
-        assert shared_pinhole([lens], Path("a")).size == (120, 160)
+        assert pinhole_of(lens).size == (120, 160)
 
 
 @pytest.mark.parametrize(
@@ -181,7 +182,7 @@ def test_importing_pycolmap_leaves_sigterm_as_it_was():
 
 @pytest.mark.parametrize("lens", [BARREL, PINCUSHION, FISHEYE])
 def test_an_image_is_resampled_to_what_a_pinhole_sees(lens):
-    pinhole = shared_pinhole([lens], Path("a"))
+    pinhole = pinhole_of(lens)
     assert pinhole.is_pinhole
     assert needs_resampling(lens, pinhole)
     expected = photograph(pinhole).astype(int)
@@ -193,57 +194,87 @@ def test_an_image_is_resampled_to_what_a_pinhole_sees(lens):
 
 
 def test_an_image_of_half_the_size_is_resampled_alike():
-    pinhole = shared_pinhole([BARREL], Path("a"))
+    pinhole = pinhole_of(BARREL)
     half = photograph(BARREL).reshape(60, 2, 80, 2, 3).mean(axis=(1, 3)).round().astype(np.uint8)
     expected = photograph(pinhole.scaled_to((60, 80))).astype(int)
     assert np.abs(resample(half, BARREL, pinhole).astype(int) - expected)[3:-3, 3:-3].max() <= 4
 
 
 def test_pincushion_is_zoomed_until_no_corner_is_empty():
-    pinhole = shared_pinhole([PINCUSHION], Path("a"))
+    pinhole = pinhole_of(PINCUSHION)
     assert 1.02 < pinhole.focal[0] / PINCUSHION.focal[0] < 1.2
     corner = PINCUSHION.image_of(pinhole, np.array([[0.0, 0.0], [160.0, 120.0]]))
     assert corner.min() >= -1
     assert (corner <= np.array([161, 121])).all()
 
 
-def test_autofocus_is_one_camera_and_used_as_it_is_only_where_it_agrees():
-    lenses = [replace(PLAIN, focal=(130.0 + n, 131.0 + n)) for n in (-1, 0, 0, 0, 1)]
-    pinhole = shared_pinhole(lenses, Path("a"))
-    # A zoom of 1 % keeps the widest frame's border filled.
-    assert pinhole.focal == pytest.approx((130.0, 131.0), rel=0.021)
-    assert needs_resampling(lenses[0], pinhole)
-    assert not needs_resampling(pinhole.scaled_to((60, 80)), pinhole)
+def test_a_pinhole_is_used_as_it_is():
+    assert pinhole_of(PLAIN) == PLAIN
+    assert not needs_resampling(PLAIN, pinhole_of(PLAIN))
 
 
-def test_lenses_of_two_cameras_are_refused():
-    tele = replace(PLAIN, focal=(260.0, 262.0))
-    with pytest.raises(
-        DataError, match=r"a\.json has images of different cameras.* 130 pixels.* 260: give the"
-    ):
-        shared_pinhole([PLAIN, PLAIN, tele], Path("a.json"))
-    upright = Lens((160, 120), (130.0, 131.0), (61.0, 78.0))
-    with pytest.raises(DataError, match=r"160x120 .* 120x160 .*held one way"):
-        shared_pinhole([PLAIN, PLAIN, upright], Path("a.json"))
+def test_a_distortion_nobody_sees_is_not_resampled():
+    lens = replace(PLAIN, model="SIMPLE_RADIAL", distortion=(1e-4,))
+    assert not needs_resampling(lens, pinhole_of(lens))
 
 
 @pytest.mark.parametrize(
-    ("lens", "message"),
+    ("lens", "message", "reason"),
     [
-        (replace(PLAIN, focal=(0.0, 1.0)), "no positive, finite focal lengths"),
-        (replace(PLAIN, center=(float("nan"), 1.0)), "no positive, finite"),
-        (replace(PLAIN, center=(1e300, 1.0)), "no positive, finite"),
-        (replace(PLAIN, focal=(1e-300, 1.0)), "no positive, finite"),
-        (replace(FISHEYE, distortion=(float("inf"), 0.0, 0.0, 0.0)), "no positive, finite"),
-        (replace(FISHEYE, distortion=(-3.0, 0.0, 0.0, 0.0)), "folds the image onto itself"),
-        (replace(PLAIN, size=(100_000, 100_000)), "for images of 100000x100000.*shrink"),
-        (replace(PLAIN, center=(300.0, 61.0)), "principal point at .*of the stored images"),
-        (replace(PLAIN, model="SIMPLE_RADIAL", distortion=(-2.0,)), "folds the image onto itself"),
+        (replace(PLAIN, focal=(0.0, 1.0)), "no positive, finite focal lengths", "not positive and finite"),
+        (replace(PLAIN, focal=(1.0, float("inf"))), "no positive, finite", "not positive and finite"),
+        (replace(PLAIN, focal=(1e-3, 1e-3)), "focal lengths of 0.001 and 0.001 pixels", "no lens has"),
+        (
+            replace(PLAIN, focal=(130.0, 1e9)),
+            "pixels for images of 160x120, as no lens has",
+            "no lens has",
+        ),
+        (replace(PLAIN, center=(float("nan"), 1.0)), "no positive, finite", "not positive and finite"),
+        (replace(PLAIN, center=(1e300, 1.0)), "no positive, finite", "not positive and finite"),
+        (replace(PLAIN, focal=(1e-300, 1.0)), "no positive, finite", "not positive and finite"),
+        (replace(FISHEYE, distortion=(float("inf"), 0.0, 0.0, 0.0)), "no positive, finite", "not positive"),
+        (replace(FISHEYE, distortion=(-3.0, 0.0, 0.0, 0.0)), "folds the image onto itself", "folds"),
+        (replace(PLAIN, size=(100_000, 100_000)), "for images of 100000x100000.*shrink", "1 to 8192 pixels"),
+        (replace(PLAIN, size=(0, 160)), "for images of 160x0", "1 to 8192 pixels"),
+        (replace(PLAIN, center=(500.0, 61.0)), "principal point at .*of the stored images", "far outside"),
+        (replace(PLAIN, model="SIMPLE_RADIAL", distortion=(-2.0,)), "folds the image onto itself", "folds"),
+        # Found by COLMAP in too few matches: it folds nothing, and moves the corners by a hundred times.
+        (replace(PLAIN, model="RADIAL", distortion=(-44.8, 1017.0)), "moves the corners out", "corners"),
+        (replace(PLAIN, model="SIMPLE_RADIAL", distortion=(3.0,)), "moves the corners out", "corners"),
+        # A crop, whose far corner sees the fold that the near ones do not.
+        (
+            replace(PLAIN, center=(0.0, 61.0), model="SIMPLE_RADIAL", distortion=(-0.3,)),
+            "folds the image onto itself",
+            "folds",
+        ),
     ],
 )
-def test_what_is_no_lens(lens, message):
-    with pytest.raises(DataError, match=f"camera 1 .*{message}"):
+def test_what_is_no_lens(lens, message, reason):
+    with pytest.raises(UnfitLens, match=f"camera 1 .*{message}") as found:
         check_lens(lens, "camera 1")
+    assert reason in found.value.reason
+    assert len(str(found.value)) <= 300
+
+
+@pytest.mark.parametrize("center", [(0.0, 61.0), (200.0, -20.0), (120.0, 30.0)])
+def test_a_crop_is_a_camera(center):
+    lens = replace(PLAIN, center=center)
+    assert check_lens(lens, "camera 1") is lens
+    assert center_fault(lens, "camera 1") is None
+
+
+@pytest.mark.parametrize(
+    ("center", "message"),
+    [
+        ((40.0, 30.0), "the middle of 80x60 and far from that of 160x120: give the intrinsics"),
+        ((160.0, 120.5), "the middle of 320x241 and"),
+        ((60.0, 80.0), "the middle of 120x160, turned by 90° and"),
+        ((259.0, 259.0), "the middle of 518x518 and"),
+    ],
+)
+def test_intrinsics_of_other_images_are_told_by_their_centre(center, message):
+    fault = center_fault(replace(PLAIN, center=center), "camera 1")
+    assert message in str(fault)
 
 
 @pytest.mark.parametrize("lens", [BARREL, FISHEYE])

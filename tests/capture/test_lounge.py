@@ -42,7 +42,7 @@ def lounge(shared_dir, tmp_path):
         shutil.copy(source.image_path[n], folder / "color")
         np.savetxt(folder / "pose" / f"{source.frame_id[n]}.txt", source.world_from_camera[n])
     matrix = np.eye(4)
-    matrix[:3, :3] = source.intrinsics
+    matrix[:3, :3] = source.intrinsics[0]
     np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", matrix)
     return folder
 
@@ -53,7 +53,7 @@ def walk(lounge, tmp_path):
     scan = read_scan(lounge)
     folder = tmp_path / "other"
     shutil.copytree(lounge / "color", folder / "images")
-    fx, fy, cx, cy = (float(scan.intrinsics[i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    fx, fy, cx, cy = (float(scan.intrinsics[0, i, j]) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2)))
     names = tuple(path.name for path in scan.image_path)
     return Walk(folder, names, scan.world_from_camera.numpy(), scan.image_size, (fx, fy, cx, cy))
 

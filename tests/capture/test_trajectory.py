@@ -3,15 +3,18 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from raytran.capture.recording import open_recording
 from raytran.capture.trajectory import in_seconds, is_tum, poses_at, read_camera, read_track, read_tum
 from raytran.errors import DataError
 
-from .forms import tum_line, words, write_tum
+from .forms import check_frames, tum_line, words, write_tum
 
 
 @pytest.fixture
@@ -134,7 +137,7 @@ def test_images_get_the_poses_of_their_times(walk, folder):
     assert scan.scene_id == "tum"
     assert scan.frame_id[1] == "1305031102.100000"
     np.testing.assert_allclose(scan.world_from_camera.numpy(), walk.poses, atol=1e-9)
-    assert scan.intrinsics.numpy()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist() == list(walk.camera)
+    assert scan.intrinsics[0].numpy()[[0, 1, 0, 1], [0, 1, 2, 2]].tolist() == list(walk.camera)
     assert scan.read_color(7)[0, 0].tolist() == [140] * 3
 
 
@@ -165,10 +168,8 @@ def test_images_between_poses_are_interpolated_and_others_counted(walk, tmp_path
 def test_poses_without_times_are_one_per_image(walk, folder):
     (folder / "trajectory.txt").write_text("\n".join(words(pose.ravel()) for pose in walk.poses))
     np.testing.assert_allclose(open_recording(read_tum(folder)).world_from_camera.numpy(), walk.poses)
-    (folder / "trajectory.txt").write_text("\n".join(words(pose.ravel()) for pose in walk.poses[1:]))
-    with pytest.raises(
-        DataError, match=r"has 12 images and 11 poses without times.*or a timestamp with each"
-    ):
+    (folder / "trajectory.txt").write_text("\n".join(words(pose.ravel()) for pose in walk.poses[2:]))
+    with pytest.raises(DataError, match=r"12 images and 10 poses without times.*or a timestamp with each"):
         read_tum(folder)
 
 
@@ -195,3 +196,175 @@ def test_clocks_that_differ_are_one_sentence(walk, tmp_path):
         DataError, match=r"none of the 12 images of .* has a pose at its time among the 12 of"
     ):
         read_tum(tmp_path / "tum")
+
+
+def name_images(walk, folder, names, times, poses=None):
+    """Write a TUM folder whose images are named otherwise than by the times of the track."""
+    write_tum(walk, folder, times)
+    for path in (folder / "rgb").iterdir():
+        path.unlink()
+    for name, new in zip(walk.names, names, strict=True):
+        (folder / "rgb" / new).write_bytes((walk.folder / "images" / name).read_bytes())
+    if poses is not None:
+        (folder / "trajectory.txt").write_text(
+            "\n".join(tum_line(t, p) for t, p in zip(times, poses, strict=True))
+        )
+    return folder
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_numbered_images_get_the_poses_of_a_track_in_seconds_if_there_are_as_many(
+    walk, tmp_path, first, caplog
+):
+    names = [f"frame_{n + first:05d}.png" for n in range(12)]
+    folder = name_images(walk, tmp_path / "tum", names, np.arange(12) / 10)
+    check_frames(open_recording(read_tum(folder)), walk)
+    assert "its images are numbered, not named by times" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("numbers", "times"),
+    [
+        (range(12), np.arange(40) / 10),  # 12 of 40 frames at 10 Hz: which?
+        (range(12), np.arange(4.0)),  # image n is no second n: they outrun the track
+        (range(0, 120, 10), np.arange(120) / 30),  # every tenth frame
+        (range(1, 13), np.arange(120) / 10),
+    ],
+)
+def test_frame_numbers_are_no_seconds(walk, tmp_path, numbers, times):
+    poses = np.tile(np.eye(4), (len(times), 1, 1))
+    folder = name_images(walk, tmp_path / "tum", [f"{n:04d}.png" for n in numbers], np.arange(12), None)
+    (folder / "trajectory.txt").write_text(
+        "\n".join(tum_line(t, p) for t, p in zip(times, poses, strict=True))
+    )
+    with pytest.raises(DataError, match=r"are numbered, and which has which of the \d+ times in traj"):
+        read_tum(folder)
+
+
+def test_whole_numbers_that_the_track_has_too_are_its_own(walk, tmp_path):
+    # A track of frame numbers, from 1; and one of the key frames among the images.
+    folder = name_images(walk, tmp_path / "a", [f"{n + 1}.png" for n in range(12)], np.arange(1, 13))
+    check_frames(open_recording(read_tum(folder)), walk)
+    folder = name_images(walk, tmp_path / "b", [f"{n}.png" for n in range(12)], np.arange(12))
+    lines = (folder / "trajectory.txt").read_text().splitlines()[1:]
+    (folder / "trajectory.txt").write_text("\n".join(lines[n] for n in (0, 3, 4, 10)))
+    scan = open_recording(read_tum(folder))
+    check_frames(scan, walk, [0, 3, 4, 10])
+    assert len(scan.dropped) == 8
+
+
+@pytest.mark.parametrize("unit", [1, 1e3, 1e6, 1e9])
+@pytest.mark.parametrize("track_unit", [1, 1e3, 1e6, 1e9])
+def test_times_since_1970_in_any_unit_on_either_side(walk, tmp_path, unit, track_unit):
+    seconds = 1680000000 + np.arange(12)
+    names = [f"{int((time + 0.003) * unit)}.png" if unit > 1 else f"{time}.png" for time in seconds]
+    folder = name_images(walk, tmp_path / "tum", names, seconds * track_unit)
+    check_frames(open_recording(read_tum(folder)), walk)
+
+
+def test_one_pose_or_image_more_is_the_last(walk, folder, caplog):
+    poses = np.concatenate([walk.poses, walk.poses[:1]])
+    (folder / "trajectory.txt").write_text("\n".join(words(pose.ravel()) for pose in poses))
+    for n, path in enumerate(sorted((folder / "rgb").iterdir())):
+        path.rename(path.with_name(f"{n:06d}.png"))
+    scan = open_recording(read_tum(folder))
+    check_frames(scan, walk)
+    assert "the last pose has no partner" in caplog.text
+    (folder / "trajectory.txt").write_text("\n".join(words(pose.ravel()) for pose in walk.poses[:11]))
+    scan = open_recording(read_tum(folder))
+    check_frames(scan, walk, range(11))
+    assert scan.dropped == {"000011": "no pose"}
+    # If one in between is missing, the numbers of the others tell.
+    (folder / "rgb" / "000005.png").unlink()
+    (folder / "trajectory.txt").write_text("\n".join(words(pose.ravel()) for pose in walk.poses))
+    check_frames(open_recording(read_tum(folder)), walk, [n for n in range(12) if n != 5])
+    # Of images from 1 it is not known whether the first or the last is missing.
+    (folder / "rgb" / "000000.png").unlink()
+    with pytest.raises(DataError, match="10 images and 12 poses without times, so what belongs together"):
+        read_tum(folder)
+
+
+def write_replica(walk, folder, *, above):
+    """Replica as SLAM programs use it."""
+    (folder / "results").mkdir(parents=True)
+    for n, name in enumerate(walk.names):
+        (folder / "results" / f"frame{n:06d}.png").write_bytes((walk.folder / "images" / name).read_bytes())
+        (folder / "results" / f"depth{n:06d}.png").write_bytes(b"depth")
+    (folder / "traj.txt").write_text("\n".join(words(pose.ravel()) for pose in walk.poses) + "\n")
+    fx, fy, cx, cy = walk.camera
+    camera = {"w": 64, "h": 48, "fx": fx, "fy": fy, "cx": cx, "cy": cy, "scale": 6553.5}
+    ((folder.parent if above else folder) / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    return folder
+
+
+@pytest.mark.parametrize("above", [True, False])
+def test_replica(walk, tmp_path, above):
+    folder = write_replica(walk, tmp_path / "replica" / "office0", above=above)
+    assert is_tum(folder)
+    scan = open_recording(read_tum(folder))
+    assert scan.scene_id == "office0"
+    check_frames(scan, walk)
+    assert scan.lens[0].focal == (50.0, 51.0)
+    assert scan.dropped == {}
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("separator", [" ", ",", "; ", "\t"])
+def test_tracks_as_spreadsheets_write_them(walk, folder, encoding, separator):
+    lines = (folder / "trajectory.txt").read_text().splitlines()[1:]
+    text = "\r\n".join(line.replace(" ", separator) for line in ["timestamp tx ty tz qx qy qz qw", *lines])
+    (folder / "trajectory.txt").write_text(text, encoding=encoding)
+    check_frames(open_recording(read_tum(folder)), walk)
+
+
+def test_a_damaged_line_is_a_lost_pose(walk, tmp_path, caplog):
+    folder = tmp_path / "slow"
+    write_tum(walk, folder, 0.5 + np.arange(12))
+    lines = (folder / "trajectory.txt").read_text().splitlines()
+    lines[4] = "tracking lost"
+    (folder / "trajectory.txt").write_text("\n".join(lines))
+    scan = open_recording(read_tum(folder))
+    check_frames(scan, walk, [n for n in range(12) if n != 3])
+    assert "1 of 12 lines hold no pose and are left out" in caplog.text
+
+
+def test_images_of_other_kinds_and_files_of_macos(walk, folder):
+    for path in list((folder / "rgb").iterdir()):
+        with Image.open(path) as image:
+            image.save(path.with_suffix(".webp"), lossless=True)
+        path.unlink()
+        path.with_name(f"._{path.stem}.webp").write_bytes(b"Mac OS X")
+    scan = open_recording(read_tum(folder))
+    assert len(scan) == 12
+    assert scan.dropped == {}
+
+
+def test_a_list_may_spell_images_otherwise(walk, folder):
+    names = sorted(path.name for path in (folder / "rgb").iterdir())
+    rows = [f"{time:.6f} rgb\\{name.upper()}" for time, name in zip(TIMES, names, strict=True)]
+    (folder / "rgb.txt").write_text("\n".join(rows) + "\n", encoding="utf-8-sig")
+    check_frames(open_recording(read_tum(folder)), walk)
+
+
+def test_typed_intrinsics_come_first(walk, folder):
+    (folder / "intrinsics.txt").unlink()
+    with pytest.raises(DataError, match="or give intrinsics=fx,fy,cx,cy"):
+        read_tum(folder)
+    scan = open_recording(read_tum(folder, walk.camera))
+    assert scan.lens[0].focal == (50.0, 51.0)
+    with pytest.raises(DataError, match=r"intrinsics=5,5,310,250 has its principal point at"):
+        read_tum(folder, (5, 5, 310, 250))
+
+
+def test_images_without_a_time_and_damaged_lines_are_left_out(walk, tmp_path, caplog):
+    folder = tmp_path / "slow"
+    write_tum(walk, folder, 0.5 + np.arange(12))
+    (folder / "rgb" / "cover.png").write_bytes(b"")
+    scan = open_recording(read_tum(folder))
+    assert scan.dropped == {"cover": "no time in its name"}
+    check_frames(scan, walk)
+    rows = [f"{n + 0.5} rgb/{n + 0.5:.6f}.png" for n in range(12)]
+    rows[4] = "lost"
+    (folder / "rgb.txt").write_text("\n".join(["time file", *rows]))
+    check_frames(open_recording(read_tum(folder)), walk, [n for n in range(12) if n != 4])
+    assert "1 of 12 lines are damaged and left out" in caplog.text

@@ -5,15 +5,19 @@ from __future__ import annotations
 
 import sys
 import wave
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from raytran.capture.open import open_scene
+from raytran.capture.orientation import WorldSettings
 from raytran.capture.video import VideoFile, find_video, open_video, read_video
+from raytran.data.images import turned_image
 from raytran.errors import ConfigError, DataError
 
-from .forms import tum_line, words, write_video
+from .forms import DISPLAY_MATRICES, tum_line, words, write_video
 
 pytest.importorskip("av", reason="PyAV, the reader of videos, is not installed")
 
@@ -146,3 +150,126 @@ def test_sound_alone_is_no_video(video):
         sound.writeframes(bytes(1000))
     with pytest.raises(DataError, match="has no pictures, only other streams: give a video"):
         read_video(video)
+
+
+UNDO = {2: 2, 3: 3, 4: 4, 6: 8, 8: 6}
+"""EXIF orientation → the one that turns back."""
+
+BLIND = WorldSettings(check=False)
+
+
+def colored(walk, turn=1):
+    """Write images of four colours, one a quarter; return that of frame 0 before it was turned back."""
+    shown = np.kron(
+        np.array([[[200, 40, 40], [40, 200, 40]], [[40, 40, 200], [220, 220, 220]]]), np.ones((24, 32, 1))
+    )
+    shown = shown.astype(np.uint8)
+    for name in walk.names:
+        Image.fromarray(turned_image(shown, UNDO[turn]) if turn != 1 else shown).save(
+            walk.folder / "images" / name
+        )
+    return shown
+
+
+@pytest.mark.parametrize("turn", DISPLAY_MATRICES)
+def test_frames_are_turned_as_they_are_displayed_and_poses_belong_to_them(walk, video, caplog, turn):
+    shown = colored(walk, turn)
+    coded = shown.shape[:2] if turn < 5 else shown.shape[1::-1]
+    write_video(walk, video / "walk.mp4", turn=turn, size=coded)
+    caplog.set_level("INFO")
+    with open_scene(video, settings=BLIND) as scan:
+        assert scan.image_size == (48, 64)
+        np.testing.assert_allclose(scan.world_from_camera.numpy(), walk.poses, atol=1e-9)
+        assert scan.intrinsics[:2, 2].tolist() == list(walk.camera[2:])
+        for n in (0, 7, 3):
+            assert np.abs(scan.read_color(n).astype(int) - shown).mean() < 6
+        assert scan.read_color(2, (24, 32)).shape == (24, 32, 3)
+    assert (
+        "of 12 images by what their files say; poses are taken to be those of the images as shown"
+        in caplog.text
+    )
+
+
+@pytest.mark.parametrize("turn", [6, 8])
+def test_intrinsics_of_the_coded_frames_are_told_by_their_aspect_and_up_turns_the_pictures(
+    walk, video, caplog, turn
+):
+    """Cameras of frames as they are coded: on their side, as the phone that was held upright filmed them."""
+    shown = colored(walk, turn)
+    write_video(walk, video / "walk.mp4", turn=turn, size=(64, 48))
+    fx, fy, cx, cy = walk.camera
+    (video / "intrinsics.txt").write_text(words((fy, fx, *((cy, 64 - cx) if turn == 6 else (48 - cy, cx)))))
+    side = (
+        np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+        if turn == 6
+        else np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1.0]])
+    )
+    poses = walk.poses.copy()
+    poses[:, :3, :3] = poses[:, :3, :3] @ side
+    (video / "walk.txt").write_text("\n".join(tum_line(n / 10, pose) for n, pose in enumerate(poses)))
+    caplog.set_level("INFO")
+    with open_scene(video, settings=BLIND) as scan:
+        assert scan.image_size == (48, 64)
+        np.testing.assert_allclose(scan.world_from_camera.numpy(), walk.poses, atol=1e-9)
+        np.testing.assert_allclose(scan.intrinsics[:2, 2], walk.camera[2:], atol=1e-9)
+        assert np.abs(scan.read_color(5).astype(int) - shown).mean() < 6
+    assert "those of the images as stored, as their intrinsics have it" in caplog.text
+
+
+def test_a_video_that_is_not_turned_says_nothing_of_it(video, caplog):
+    caplog.set_level("INFO")
+    with open_scene(video, settings=BLIND) as scan:
+        assert scan.images.tags is None
+    assert "images by what" not in caplog.text
+
+
+UNEVEN = np.cumsum([0, 30, 34, 90, 33, 33, 60, 31, 36, 120, 33, 33])
+"""Milliseconds at which a phone took twelve frames, with some lost in the dark."""
+
+
+def test_times_of_a_variable_rate_are_those_at_which_frames_are_shown(walk, video):
+    write_video(walk, video / "walk.mp4", times=UNEVEN)
+    lines = [tum_line(time / 1000, pose) for time, pose in zip(UNEVEN, walk.poses, strict=True)]
+    (video / "walk.txt").write_text("\n".join(lines))
+    with open_video(read_video(video)) as scan:
+        np.testing.assert_allclose(scan.world_from_camera.numpy(), walk.poses, atol=1e-6)
+        for n in (0, 11, 5):
+            assert abs(scan.read_color(n).mean() - 20 * n) < 4
+    # Poses without times are one per frame, whatever their rate.
+    (video / "walk.txt").write_text("\n".join(words(pose.ravel()) for pose in walk.poses))
+    np.testing.assert_allclose(open_video(read_video(video)).world_from_camera.numpy(), walk.poses)
+
+
+@pytest.mark.parametrize(
+    ("rate", "start", "kept"),
+    [(30, 0, range(12)), (30, 1, range(12)), (25, 0, range(12)), (30, 0, [0, 1, 2, 5, 6, 7, 8, 10, 11])],
+)
+def test_poses_at_a_constant_rate_beside_a_variable_one_are_matched_by_number(
+    walk, video, caplog, rate, start, kept
+):
+    write_video(walk, video / "walk.mp4", times=UNEVEN)
+    lines = [tum_line((n + start) / rate, walk.poses[n]) for n in kept]
+    (video / "walk.txt").write_text("\n".join(lines))
+    with open_video(read_video(video)) as scan:
+        assert scan.frame_id == tuple(map(str, kept))
+        np.testing.assert_allclose(scan.world_from_camera.numpy(), walk.poses[list(kept)], atol=1e-6)
+    assert f"the poses in walk.txt, {len(kept)} for 12 frames: they are matched by number" in caplog.text
+
+
+def test_a_tracker_of_its_own_rate_is_matched_by_time(walk, video, caplog):
+    """A hundred poses a second beside frames of variable rate: each frame gets the pose of its time."""
+    write_video(walk, video / "walk.mp4", times=UNEVEN)
+    fine = replace(walk, poses=np.repeat(walk.poses[:1], 60, axis=0))
+    fine.poses[:, 0, 3] = np.arange(60) * 0.01
+    (video / "walk.txt").write_text("\n".join(tum_line(n / 100, pose) for n, pose in enumerate(fine.poses)))
+    with open_video(read_video(video)) as scan:
+        np.testing.assert_allclose(scan.world_from_camera[:, 0, 3].numpy(), UNEVEN / 1000, atol=0.006)
+    assert "matched by number" not in caplog.text
+
+
+def test_a_rate_that_was_told_wrong_is_matched_by_number(walk, video, caplog):
+    """A track at 12 poses a second of a video with ten frames a second, one pose each."""
+    (video / "walk.txt").write_text("\n".join(tum_line(n / 12, pose) for n, pose in enumerate(walk.poses)))
+    with open_video(read_video(video)) as scan:
+        np.testing.assert_allclose(scan.world_from_camera.numpy(), walk.poses, atol=1e-6)
+    assert "matched by number" in caplog.text

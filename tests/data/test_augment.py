@@ -152,6 +152,18 @@ def test_mirrored_models_project_to_the_mirrored_pixels(scene) -> None:
         assert torch.equal(getattr(mirrored.objects[0], name), getattr(scene.objects[0], name))
 
 
+def test_pictures_are_mirrored_with_their_images(scene) -> None:
+    assert mirror_scene(scene).views.picture is None
+    picture = torch.tensor([[[10.0, 0.0, 30.0, 48.0], [0, 0, 64, 48], [0, 5, 64, 40]]])
+    mirrored = mirror_scene(replace(scene, views=replace(scene.views, picture=picture)))
+    expected = [
+        [SIZE[1] - 30, 0, SIZE[1] - 10, 48],
+        [SIZE[1] - 64, 0, SIZE[1], 48],
+        [SIZE[1] - 64, 5, SIZE[1], 40],
+    ]
+    assert mirrored.views.picture[0].tolist() == expected
+
+
 def test_mirrored_shapes_are_those_of_the_mirrored_mesh(scene) -> None:
     mirrored = torch.from_numpy(voxelize_solid(VERTICES @ MIRROR, FACES[:, ::-1]))
     shape = mirror_scene(scene).objects[0].shape[0]

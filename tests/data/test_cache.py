@@ -83,7 +83,7 @@ def test_several_writers_and_a_reader(tmp_path) -> None:
 
 def test_folder_that_cannot_be_written(tmp_path) -> None:
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(DataError, match="choose another cache_dir"):
+    with pytest.raises(DataError, match=r"data\.dataset\.cache_dir="):
         MaskCache(folder=tmp_path / "file").write("shape", "ab12", MASK)
 
 

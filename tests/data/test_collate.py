@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -50,3 +52,14 @@ def test_targets_that_were_not_asked_for_stay_none() -> None:
 def test_scenes_with_unequal_views_cannot_be_joined() -> None:
     with pytest.raises(ShapeError, match="one number and size"):
         collate_scenes([sample("a", 1.0), sample("b", 2.0, num_views=3)])
+
+
+def test_pictures_are_joined_with_those_that_fill_their_images() -> None:
+    first, second = sample("a", 1.0), sample("b", 2.0)
+    assert collate_scenes([first, second]).views.picture is None
+    picture = torch.tensor([[[1.0, 0.0, 3.0, 4.0], [0.0, 0.0, 6.0, 4.0]]])
+    first = replace(first, views=replace(first.views, picture=picture))
+    joined = collate_scenes([first, second]).views
+    assert torch.equal(joined.picture, torch.cat([picture, picture[:, 1:].expand(1, 2, 4)]))
+    assert torch.equal(joined.scene(0).picture, picture[0])
+    assert torch.equal(joined.select(slice(0, 1)).picture[0], picture[0, :1])

@@ -295,9 +295,7 @@ class TestForeground:
         objects = scene_objects(read_annotations(root / "scan2cad" / "full_annotations.json")["scene0470_00"])
         paths = sorted((root / "reference" / "amodal_mask").iterdir())
         index = [scan.frame_id.index(path.stem) for path in paths]
-        cameras = Cameras(
-            scan.intrinsics.expand(len(index), 3, 3), scan.world_from_camera[index], scan.image_size
-        )
+        cameras = scan.cameras[index]
         masks = foreground_masks(
             objects, cameras, shapenet_root=root / "shapenet", cache=MaskCache(folder=tmp_path)
         ).numpy()

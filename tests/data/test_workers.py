@@ -1,17 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import gc
 import math
 import os
 import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
+from torch.utils.data import DataLoader
 
-from raytran.data.workers import work_on
-from raytran.errors import DataError
+from raytran.checkpoints.file import DamagedCheckpointError
+from raytran.data.workers import become_worker, work_on
+from raytran.errors import ConfigError, DataError, ShapeError
 
 
 def test_each_item_once_in_this_process():
@@ -83,3 +87,85 @@ def running(pid):
             return file.read().rsplit(")", 1)[1].split()[0] != "Z"
     except OSError:
         return False
+
+
+CHILD = """
+import sys, time
+from multiprocessing import get_context
+from raytran.data.workers import end_with_parent
+if __name__ == "__main__":
+    worker = get_context("fork").Process(target=time.sleep, args=(90,), daemon=True)
+    worker.start()
+    end_with_parent("the first has ended", parent=int(sys.argv[1]) if len(sys.argv) > 1 else None)
+    print(worker.pid, flush=True)
+    time.sleep(90)
+"""
+
+PARENT = f"""
+import subprocess, sys
+child = subprocess.Popen([sys.executable, "-c", {CHILD!r}])
+print(child.pid, flush=True)
+child.wait()
+"""
+
+
+def test_a_process_and_its_workers_end_with_the_parent_and_say_so():
+    parent = subprocess.Popen(
+        [sys.executable, "-c", PARENT], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    pids = [int(parent.stdout.readline()) for _ in range(2)]
+    parent.kill()
+    began = time.monotonic()
+    _, said = parent.communicate(timeout=60)  # until all have closed what they inherited
+    assert said == "raytran: the first has ended\n"
+    while any(is_running(pid) for pid in pids):
+        assert time.monotonic() - began < 5
+
+
+def test_a_process_whose_parent_has_ended_before_it_looks_ends_too():
+    done = subprocess.run(
+        [sys.executable, "-c", CHILD, "999999999"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert (done.returncode, done.stderr) == (1, "raytran: the first has ended\n")
+
+
+def is_running(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+class Scenes:
+    """The second cannot be read."""
+
+    def __init__(self, error):
+        self.error = error
+
+    def __len__(self):
+        return 2
+
+    def __getitem__(self, index):
+        if index == 1:
+            raise self.error
+        return index
+
+
+@pytest.mark.parametrize("kind", [DataError, ConfigError, DamagedCheckpointError, ShapeError])
+def test_a_sentence_of_a_loaders_worker_keeps_its_kind_and_stays_one(kind):
+    error = kind("cannot read the image a: b.jpg ([Errno 2] No such file): copy it again")
+    with pytest.raises(kind) as raised:
+        list(DataLoader(Scenes(error), num_workers=1, worker_init_fn=init_worker))
+    assert str(raised.value) == str(error)
+    assert type(raised.value) is kind
+    del raised
+    gc.collect()  # else PyTorch may end this loader in a worker of the next one, which takes ten seconds
+
+
+def init_worker(_):
+    become_worker()
+
+
+def test_a_defect_in_a_loaders_worker_keeps_its_traceback():
+    with pytest.raises(ZeroDivisionError, match="Original Traceback"):
+        list(DataLoader(Scenes(ZeroDivisionError()), num_workers=1))

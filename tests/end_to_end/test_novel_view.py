@@ -61,7 +61,7 @@ def test_a_prediction_renders_a_list_of_cameras(trained, rooms, tmp_path):
     parent, fit = trained
     scene = next((rooms / "scannet" / "scans").iterdir())
     with open_scan(scene) as scan:
-        poses, matrix, size = scan.world_from_camera[:3], scan.intrinsics, scan.image_size
+        poses, matrix, size = scan.world_from_camera[:3], scan.intrinsics[0], scan.image_size
     views = [{"name": f"pose {n}", "world_from_camera": pose.tolist()} for n, pose in enumerate(poses)]
     listed = tmp_path / "cameras.json"
     listed.write_text(json.dumps({"image_size": list(size), "intrinsics": matrix.tolist(), "views": views}))

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import random
 import shutil
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from raytran.checkpoints.runs import FINISHED, LAST, PREVIOUS, one_at_a_time
+from raytran.checkpoints.runs import FINISHED, LAST, PREVIOUS, one_at_a_time, read_finished
 from raytran.errors import CheckpointError, ConfigError
 from raytran.training.lightning_module import Reconstruction
 
@@ -213,6 +214,68 @@ def test_an_earlier_checkpoint_can_be_named(base, straight, tmp_path, caplog):
     fit(base, run, f"resume={run / PREVIOUS}")
     assert_same(run, straight)
     assert "another setting" not in caplog.text
+
+
+def test_a_finished_run_goes_on_with_more_steps(base, straight, tmp_path, caplog):
+    run, few = tmp_path / "run", f"trainer.max_steps={STEPS // 2}"
+    assert fit(base, run, few).steps == STEPS // 2
+    written = (run / LAST).stat().st_mtime_ns
+    with caplog.at_level(logging.INFO, logger="raytran"):
+        for same_or_fewer in (few, "trainer.max_steps=2"):
+            assert fit(base, run, same_or_fewer).steps == STEPS // 2
+    assert caplog.text.count("has finished already (stage1, 4 steps)") == 2
+    assert (run / LAST).stat().st_mtime_ns == written
+    assert fit(base, run).steps == STEPS
+    assert "another setting, trainer.max_steps: 4 → 8" in caplog.text
+    # The learning rate still rises in all of these steps, so that it does not know how many come.
+    assert_same(run, straight)
+    assert read_finished(run).steps == STEPS
+
+
+def test_a_finished_run_goes_on_from_the_command_line(settings, tmp_path, command):
+    words = [
+        *settings,
+        "experiment=stage1",
+        "watch.pictures=0",
+        "trainer.val_check_interval=2",
+        "progress_bar=none",
+    ]
+    run = "output_dir=run (1)"  # the words of the run's folder are quoted for Hydra
+
+    def train(*more):
+        done = command("train", *words, run, *more, folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+        return done.stdout + done.stderr
+
+    train("trainer.max_steps=2")
+    assert "goes on" in train("trainer.max_steps=4", "resume=run (1)/checkpoints/last.ckpt")
+    assert "has finished already (stage1, 4 steps)" in train("trainer.max_steps=4", "resume=auto")
+    assert read_finished(tmp_path / "run (1)").steps == 4
+
+
+def test_a_finished_run_that_goes_on_is_unfinished(base, straight, tmp_path, monkeypatch):
+    run = tmp_path / "run"
+    fit(base, run, f"trainer.max_steps={STEPS // 2}")
+    with monkeypatch.context() as context:
+        kill_at(context, "training_step", 3)
+        with pytest.raises(Killed):
+            fit(base, run, f"resume={run / LAST}")
+    assert not (run / FINISHED).exists()
+    fit(base, run)
+    assert_same(run, straight)
+
+
+def test_a_run_that_stopped_early_has_finished(base, tmp_path, caplog):
+    """Its mark has fewer steps than it was given: these are not more than before."""
+    run = tmp_path / "run"
+    fit(base, run, f"trainer.max_steps={STEPS // 2}")
+    config = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(config.replace("max_steps: 4", f"max_steps: {STEPS}"))
+    with caplog.at_level(logging.INFO, logger="raytran"):
+        assert fit(base, run).steps == STEPS // 2
+    assert "has finished already" in caplog.text
+    (run / "config.yaml").write_text("[")  # damaged: the steps taken count
+    assert fit(base, run).steps == STEPS
 
 
 def test_two_processes_do_not_train_in_one_folder(base, tmp_path):

@@ -8,7 +8,7 @@ import torch
 
 from raytran.errors import DataError
 from raytran.export.cad_alignments import SCAN2CAD_COLUMNS, write_alignments_csv
-from raytran.export.read import ROCA_COLUMNS, read_alignments_csv, read_roca_csv
+from raytran.export.read import ROCA_COLUMNS, read_alignments_csv, read_predictions, read_roca_csv
 from raytran.structs import CadAlignments
 
 ROW = "03001627,abc,1,2,3,1,0,0,0,0.5,0.6,0.7"
@@ -106,6 +106,61 @@ def test_rocas_file_holds_many_scenes(tmp_path):
     assert scenes["a"].model_id == ("03001627/abc",)
     with pytest.raises(DataError, match="line 1 has 12 columns"):
         read_roca_csv(write(tmp_path, ROW))
+
+
+def test_a_thirteenth_column_is_the_score(tmp_path, caplog):
+    path = write(
+        tmp_path, ",".join([*SCAN2CAD_COLUMNS, "score"]), ROW + ",0.25", ROW.replace("abc", "1e5") + ",0.5"
+    )
+    alignments = read_alignments_csv(path)
+    assert alignments.score.tolist() == [0.25, 0.5]
+    assert alignments.model_id == ("03001627/abc", "03001627/1e5")
+    assert f"{path}, line 1: skipped a header row" in caplog.text
+
+
+def test_scan2cads_own_example_has_no_scores(tmp_path):
+    header = "scanId,objectCategory,alignedModelId,tx,ty,tz,qw,qx,qy,qz,sx,sy,sz"
+    for lines in ([header], []):
+        rows = [f"scene0470_00,{ROW}", f"0470_00,{ROW.replace('abc', '1234')}"]
+        scenes = read_roca_csv(write(tmp_path, *lines, *rows))
+        assert list(scenes) == ["scene0470_00", "0470_00"]
+        assert scenes["scene0470_00"].score.tolist() == [1]
+        assert scenes["0470_00"].model_id == ("03001627/1234",)
+        assert scenes["0470_00"].scale.tolist() == [[0.5, 0.6, 0.7]]
+
+
+def test_vid2cads_file_leaves_out_what_all_scenes_are_called(tmp_path):
+    """As ODAM reads it: the 15th column is the number of views, the 16th the score."""
+    header = "id_scan,catid,id_cad,tx,ty,tz,qw,qx,qy,qz,sx,sy,sz,extra,num_frames,score"
+    path = write(tmp_path, header, f"0470_00,{ROW},x,90,0.8", f"0011_00,{ROW},,7,0.1")
+    scenes = read_roca_csv(path)
+    assert list(scenes) == ["0470_00", "0011_00"]
+    assert scenes["0470_00"].score.tolist() == [0.8]
+    files = read_predictions(path, ["scene0470_00"], {})
+    assert list(files.scenes) == ["scene0470_00"]
+    assert files.ignored == ("0011_00",)
+    # Where the annotations call their scenes so too, the names are as they are.
+    assert list(read_predictions(path, ["0470_00", "scene0470_00"], {}).scenes) == ["0470_00"]
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        ([ROW + ",0.5"], "line 1 has 13 columns"),  # a score, but of which scene?
+        ([f"scene0000_00,{ROW}", f"scene0000_00,{ROW},1"], "line 2 has 14 columns"),
+        ([f"scene0000_00,{ROW},x,90,"], "score is ''"),
+        ([f"scene0000_00,{ROW},1,2"], "line 1 has 15 columns: write the 14 columns .* or 13 or 16"),
+    ],
+)
+def test_rows_of_no_form(tmp_path, rows, said):
+    with pytest.raises(DataError, match=said) as caught:
+        read_roca_csv(write(tmp_path, *rows))
+    assert len(str(caught.value)) - len(str(tmp_path)) < 260
+
+
+def test_semicolons_of_spreadsheets(tmp_path):
+    alignments = read_alignments_csv(write(tmp_path, ROW.replace(",", ";"), ROW.replace(",", ";")))
+    assert alignments.scale.tolist() == [[0.5, 0.6, 0.7]] * 2
 
 
 def test_only_the_first_row_may_be_a_header(tmp_path):

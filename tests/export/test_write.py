@@ -128,8 +128,11 @@ def test_files_of_a_mesh_hold_the_same_mesh_in_the_world(tmp_path, prediction, b
     assert np.allclose(ply.bounds, [[0.75, 1.7, 0.0], [1.25, 2.3, 1.0]])
     assert ply.visual.vertex_colors[0].tolist() == [31, 119, 180, 255]
     obj = trimesh.load(tmp_path / "meshes" / "00.obj", process=False)
-    assert np.allclose(obj.vertices, ply.vertices, atol=1e-5)
+    # The PLY is in the world, +Z up; readers of OBJ take +Y for up.
+    assert np.allclose(obj.vertices, ply.vertices[:, [0, 2, 1]] * [1, 1, -1], atol=1e-5)
+    assert np.allclose(obj.bounds, [[0.75, 0.0, -2.3], [1.25, 1.0, -1.7]], atol=1e-5)
     assert np.array_equal(obj.faces, ply.faces)
+    assert obj.volume > 0
     assert obj.visual.material.main_color.tolist() == [31, 119, 180, 255]
     lines = (tmp_path / "meshes" / "00.obj").read_text().splitlines()
     assert {"mtllib 00.mtl", "o 00_chair", "usemtl chair"} <= set(lines)

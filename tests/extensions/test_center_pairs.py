@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
 from raytran.extensions.unprojection import pair_centers
@@ -61,3 +63,15 @@ def test_cameras_that_see_nothing_pair_nothing(generator: torch.Generator) -> No
     cameras, grid = make_scenes(generator)
     away = VoxelGrid(grid.resolution, grid.extent, grid.center - torch.tensor([0.0, 50.0, 0.0]))
     assert len(pair_centers(cameras, away, FEATURE_SIZE)) == 0
+
+
+def test_voxels_outside_of_a_picture_are_not_seen(generator: torch.Generator) -> None:
+    cameras, grid = make_scenes(generator)
+    # Columns 2 and 3 of six, 8 pixels each.
+    picture = torch.tensor([16.0, 0.0, 32.0, 32.0]).expand(2, 3, 4)
+    pairs = pair_centers(replace(cameras, picture=picture), grid, FEATURE_SIZE)
+    whole = pair_centers(cameras, grid, FEATURE_SIZE)
+    inside = (whole.pixel_index % 6).ge(2) & (whole.pixel_index % 6).lt(4)
+    assert 0 < inside.sum() < len(whole)
+    assert torch.equal(pairs.pixel_index, whole.pixel_index[inside])
+    assert torch.equal(pairs.voxel_index, whole.voxel_index[inside])

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 
 from raytran.errors import ShapeError
-from raytran.geometry.camera import Cameras
+from raytran.geometry.camera import Cameras, other_image_size
 
 K = torch.tensor([[500.0, 0.0, 310.0], [0.0, 480.0, 250.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
@@ -85,3 +88,92 @@ def test_wrong_shapes():
         Cameras(torch.eye(3), torch.eye(3), (480, 640))
     with pytest.raises(ShapeError, match="as many intrinsics as poses"):
         Cameras(torch.eye(3).expand(2, 3, 3), torch.eye(4).expand(3, 4, 4), (480, 640))
+
+
+PICTURE = torch.tensor([[16.0, 0.0, 32.0, 30.25], [0.0, 4.0, 48.0, 32.0]])
+
+
+def pair_of_cameras() -> Cameras:
+    intrinsics = torch.tensor([[40.0, 0, 20], [0, 42, 18], [0, 0, 1]]).expand(2, 3, 3)
+    pose = torch.stack([_pose(1), _pose(2)]).float()
+    return Cameras(intrinsics, pose, (32, 48), PICTURE)
+
+
+def test_cameras_are_chosen_scaled_and_moved_with_their_pictures():
+    cameras = pair_of_cameras()
+    assert cameras[1].picture.tolist() == PICTURE[1].tolist()
+    assert cameras[[1, 0]].picture.tolist() == PICTURE[[1, 0]].tolist()
+    assert cameras[None][:, 1:].intrinsics.shape == (1, 1, 3, 3)
+    assert cameras.scaled_to((16, 96)).picture.tolist() == [[32, 0, 64, 15.125], [0, 2, 96, 16]]
+    assert cameras.to(torch.float64).picture.dtype == torch.float64
+    assert replace(cameras, picture=None)[0].picture is None
+
+
+def test_a_camera_sees_what_is_in_its_picture_and_in_front():
+    pixels = torch.tensor([[15.9, 1], [16, 0], [31.9, 29.9], [32, 10], [20, 30.25]]).expand(2, 5, 2)
+    cameras, depth = pair_of_cameras(), torch.ones(2, 5)
+    expected = [[False, True, True, False, False], [False, False, True, True, True]]
+    assert cameras.sees(pixels, depth).tolist() == expected
+    assert not cameras.sees(pixels, -depth).any()
+    assert replace(cameras, picture=None).sees(pixels, depth).all()
+
+
+def test_rays_through_the_picture_are_those_whose_points_are_in_it():
+    cameras = pair_of_cameras()
+    origin, directions = cameras.cell_rays((4, 6), 2)
+    points = (origin + directions).flatten(1, 3)
+    expected = cameras.sees(*cameras.project(points)).view(2, 4, 6, 4)
+    assert torch.equal(cameras.cells_in_picture((4, 6), 2), expected)
+    assert replace(cameras, picture=None).cells_in_picture((4, 6), 2) is None
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3, 4])
+def test_images_and_cameras_are_turned_together(quarters):
+    cameras = pair_of_cameras()
+    turned = cameras
+    for _ in range(quarters):
+        turned = turned.quarter_turned()
+    assert turned.image_size == ((32, 48) if quarters % 2 == 0 else (48, 32))
+    # What each pixel shows, as an image that is turned with numpy.
+    pixels = np.stack(np.meshgrid(np.arange(48) + 0.5, np.arange(32) + 0.5), axis=-1)
+    before = np.rot90(pixels, quarters).reshape(-1, 2).copy()
+    height, width = turned.image_size
+    after = np.stack(np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5), axis=-1).reshape(-1, 2)
+    homogeneous = torch.from_numpy(np.c_[before, np.ones(len(before))]).float()
+    rays = torch.linalg.inv(cameras.intrinsics[0]) @ homogeneous.T
+    pose = cameras.world_from_camera[0]
+    points = (pose[:3, :3] @ rays).T * 2 + pose[:3, 3]
+    seen, depth = turned[0].project(points)
+    torch.testing.assert_close(seen, torch.from_numpy(after).float(), atol=1e-3, rtol=0)
+    torch.testing.assert_close(depth, torch.full_like(depth, 2.0))
+    in_picture = cameras[0].sees(torch.from_numpy(before), depth)
+    assert torch.equal(turned[0].sees(torch.from_numpy(after), depth), in_picture)
+
+
+def test_pictures_of_a_wrong_shape():
+    for shape, message in (((2, 3), "expected picture of shape"), ((3, 4), "as many pictures as intrinsics")):
+        with pytest.raises(ShapeError, match=message):
+            replace(pair_of_cameras(), picture=torch.zeros(shape))
+
+
+@pytest.mark.parametrize(
+    ("center", "size", "other"),
+    [
+        ((320, 240), (480, 640), None),
+        ((160, 120), (480, 640), (240, 320)),
+        ((640, 480), (480, 640), (960, 1280)),
+        ((240, 320), (480, 640), (640, 480)),
+        ((259, 259), (720, 1280), (518, 518)),
+        # Crops: the right half of an image, a strip from below its middle, a corner beyond it.
+        ((0, 240), (480, 320), None),
+        ((320, -100), (100, 640), None),
+        ((-30, -40), (480, 640), None),
+    ],
+)
+def test_for_which_other_images_intrinsics_are(center, size, other):
+    assert other_image_size(center, size) == other
+
+
+def test_a_principal_point_in_the_corner_is_that_of_no_image() -> None:
+    assert other_image_size((0.2, 0.15), (48, 64)) is None
+    assert other_image_size((320.0, 240.0), (48, 64)) == (480, 640)

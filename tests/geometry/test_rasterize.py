@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -116,3 +118,12 @@ def test_camera_without_leading_dimension_is_an_error() -> None:
     one = camera()
     with pytest.raises(ShapeError, match="intrinsics"):
         rasterize_mask([], Cameras(one.intrinsics[0], one.world_from_camera[0], one.image_size))
+
+
+def test_nothing_is_drawn_outside_of_the_picture() -> None:
+    mesh, picture = square(0, 0, 8, 8, z=2.0), torch.tensor([[2.0, 0.0, 5.0, 8.0]])
+    inside = replace(camera(), picture=picture)
+    assert rasterize_mask([mesh], inside)[0].nonzero()[:, 1].unique().tolist() == [2, 3, 4]
+    ids, depths = rasterize_ids([mesh], inside)
+    assert ((ids == 0) == rasterize_mask([mesh], inside)).all()
+    assert depths.isinf().equal(ids < 0)

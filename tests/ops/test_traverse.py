@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from fractions import Fraction
 from math import floor
 from pathlib import Path
@@ -55,6 +56,39 @@ def test_equals_slab_test_of_every_voxel_for_grazing_cameras(random_cameras, gen
     actual = trace_pairs(cameras, grid, (3, 5), 1)
     assert len(actual) > 100
     _assert_equal(actual, reference.trace_pairs(cameras, grid, (3, 5), 1))
+
+
+PICTURES = [[0.0, 0, 80, 60], [21.0, 0, 47, 60], [0.0, 13, 80, 31], [30.0, 20, 31, 21]]
+"""In images of 80×60: all of it, the middle columns, some rows, and a pixel that no ray passes through."""
+
+
+@pytest.mark.parametrize("rays_per_cell", [1, 2, 3])
+@pytest.mark.parametrize("spread", [0.3, 1.5], ids=["inside", "around"])
+def test_equals_slab_test_of_every_voxel_where_pictures_fill_a_part(random_cameras, spread, rays_per_cell):
+    picture = torch.tensor(PICTURES, dtype=torch.float64).repeat(3, 1)
+    cameras = replace(random_cameras(12, spread=spread), picture=picture)
+    grid = VoxelGrid((6, 5, 3), (3.1, 2.3, 1.7), torch.tensor([0.1, -0.2, 0.05], dtype=torch.float64))
+    actual = trace_pairs(cameras, grid, (3, 4), rays_per_cell)
+    whole = trace_pairs(replace(cameras, picture=None), grid, (3, 4), rays_per_cell)
+    assert 10 < len(actual) < len(whole)
+    _assert_equal(actual, reference.trace_pairs(cameras, grid, (3, 4), rays_per_cell))
+    everything = picture.new_tensor(PICTURES[0]).expand(12, 4)
+    _assert_equal(trace_pairs(replace(cameras, picture=everything), grid, (3, 4), rays_per_cell), whole)
+
+
+def test_a_picture_within_a_larger_image_gives_the_pairs_of_its_own(random_cameras):
+    """The same frame, 16 wide in an image of 48: its cells are columns 2 and 3 of six."""
+    own = random_cameras(5, spread=0.5)
+    own = Cameras(own.intrinsics, own.world_from_camera, (32, 16))
+    shift = torch.tensor([[0.0, 0, 16], [0, 0, 0], [0, 0, 0]], dtype=torch.float64)
+    picture = torch.tensor([16.0, 0.0, 32.0, 32.0], dtype=torch.float64).expand(5, 4)
+    padded = Cameras(own.intrinsics + shift, own.world_from_camera, (32, 48), picture)
+    grid = VoxelGrid((6, 5, 3), (3.1, 2.3, 1.7), torch.zeros(3, dtype=torch.float64))
+    expected, actual = trace_pairs(own, grid, (4, 2)), trace_pairs(padded, grid, (4, 6))
+    row, column = actual.pixel_index // 6, actual.pixel_index % 6
+    assert torch.equal(row * 2 + column - 2, expected.pixel_index)
+    assert torch.equal(actual.voxel_index, expected.voxel_index)
+    assert torch.equal(count_views(padded, grid, (4, 6)), count_views(own, grid, (4, 2)))
 
 
 def _exact_voxels(origin: list[Fraction], ray: list[Fraction], resolution: tuple[int, ...]) -> set[int]:

@@ -2,11 +2,20 @@
 from __future__ import annotations
 
 import json
+import logging
 import shutil
+import subprocess
+import sys
+import threading
+import time
+from contextlib import nullcontext
+from functools import partial
 
 import pytest
 
+from raytran.data.locks import lock_when_free
 from raytran.errors import ConfigError, DataError
+from raytran.rooms import generate
 from raytran.rooms.generate import generate_rooms
 
 from ..factories import digests
@@ -54,6 +63,57 @@ def test_a_broken_off_run_is_finished(made, tmp_path):
     report = generate_rooms(copy, num_train=2, num_val=1, processes=1, **SMALL)
     assert report.made == 1
     assert digests(copy) == digests(root)
+
+
+STOP_IN_A_ROOM = f"""
+import sys
+from pathlib import Path
+from raytran.rooms import generate, write
+
+def stop_once(folder, number, *rest, write_frame=write._write_frame):
+    write_frame(folder, number, *rest)
+    write._write_frame = write_frame
+    print(flush=True)
+    sys.stdin.readline()
+
+write._write_frame = stop_once
+generate.generate_rooms(Path(sys.argv[1]), num_train=2, num_val=1, processes=1, **{SMALL})
+"""
+
+
+def test_three_who_make_the_same_rooms_at_once_make_them_whole(made, tmp_path, monkeypatch, caplog):
+    """As jobs of a sweep do that find none. In 400 tries, 344 rooms were not whole once, without an error."""
+    caplog.set_level(logging.INFO, "raytran")
+    make = partial(generate.generate_rooms, tmp_path, num_train=2, num_val=1, processes=1, **SMALL)
+    first = subprocess.Popen(
+        [sys.executable, "-c", STOP_IN_A_ROOM, str(tmp_path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert first.stdout.readline() == "\n"  # it has written one frame
+    reports = []
+    second = threading.Thread(target=lambda: reports.append(make()))
+    second.start()
+    while not caplog.messages:
+        time.sleep(0.01)
+    assert f"another process makes the rooms in {tmp_path} (number {first.pid} on" in caplog.text
+    # On a disk on which no lock works nobody waits, and a third takes nothing away either.
+    monkeypatch.setattr(generate, "lock_when_free", lambda *_, **__: nullcontext())
+    assert make().made == 3
+    _, said = first.communicate("\n")
+    assert (first.returncode, said) == (0, "")
+    second.join()
+    assert [report.made for report in reports] == [0]
+    assert digests(tmp_path) == digests(made[0])
+    assert not [path for path in tmp_path.rglob("*") if path.name.startswith(".")]
+
+
+def test_other_settings_are_told_before_a_wait(made):
+    root, _ = made
+    with lock_when_free(root / ".rooms.lock", work=""), pytest.raises(DataError, match="other settings"):
+        generate_rooms(root, num_train=2, num_val=1, processes=1, **(SMALL | {"seed": 4}))
 
 
 def test_other_settings_are_refused(made):

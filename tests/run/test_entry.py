@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import errno
+import os
 import subprocess
 import sys
 
@@ -9,7 +11,7 @@ from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 
 from raytran.errors import DataError
-from raytran.run.entry import compose, name_positional, run_or_exit
+from raytran.run.entry import compose, name_positional, run_or_exit, with_number_lists
 
 
 def raise_error(error):
@@ -40,6 +42,55 @@ def test_a_missing_setting_is_one_sentence(capsys):
     assert "checkpoint" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG])
+def test_a_full_disk_is_one_sentence(capsys, number):
+    wrapped = ValueError("cannot encode")
+    wrapped.__cause__ = OSError(number, os.strerror(number), "out/a.png")
+    for error in (wrapped, wrapped.__cause__):
+        with pytest.raises(SystemExit) as stop:
+            run_or_exit(raise_error(error), OmegaConf.create())
+        assert stop.value.code == 1
+        (sentence,) = capsys.readouterr().err.splitlines()
+        assert sentence.startswith(f"raytran: cannot write out/a.png ({os.strerror(number)}): make room")
+
+
+@pytest.mark.parametrize(
+    ("command_name", "typed"),
+    [
+        ("predict", ["scene={}", "output=x"]),
+        ("predict", ["scene=.", "output={}"]),
+        ("predict", ["scene=.", "output=x", "checkpoint={}"]),
+        ("prepare", ["check={}"]),
+        ("train", ["output_dir={}", "preset=tiny"]),
+        ("curriculum", ["outputs={}", "preset=tiny"]),
+        ("view", ["folder={}"]),
+    ],
+)
+@pytest.mark.parametrize("path", ["a" * 5000, "b" * 300], ids=["path", "name"])
+def test_a_path_that_the_system_refuses_is_one_sentence(command_name, typed, path, tmp_path, command):
+    done = command(command_name, *[word.format(path) for word in typed], folder=tmp_path)
+    (sentence,) = done.stderr.splitlines()
+    assert done.returncode == 1
+    assert "(File name too long): " in sentence
+    assert len(sentence) <= 300
+
+
+def test_a_file_in_the_place_of_a_folder_is_one_sentence(tmp_path, command):
+    (tmp_path / "file").touch()
+    done = command("train", "preset=tiny", "output_dir=file/x", folder=tmp_path)
+    assert done.returncode == 1
+    assert (
+        done.stderr == "raytran: cannot use file/x (Not a directory): choose another path, or mend this one\n"
+    )
+
+
+def test_an_interrupt_is_one_line_and_exit_code_130(capsys):
+    with pytest.raises(SystemExit) as stop:
+        run_or_exit(raise_error(KeyboardInterrupt()), OmegaConf.create())
+    assert stop.value.code == 130
+    assert capsys.readouterr().err.startswith("raytran: interrupted")
+
+
 def test_a_defect_keeps_its_traceback():
     with pytest.raises(ZeroDivisionError):
         run_or_exit(lambda cfg: 1 / 0, OmegaConf.create())
@@ -49,7 +100,11 @@ def test_a_defect_keeps_its_traceback():
     ("typed", "said"),
     [
         ("learning_speed=3", "learning_speed"),
-        ("model=tinny", "model/tinny"),
+        ("model=tinny", "Could not find 'model/tinny': choose one of laptop, raytran, small, tiny"),
+        ("cache_dir=x", "there is no setting cache_dir: is data.dataset.cache_dir meant?"),
+        ("data.cache_dir=x", "is data.dataset.cache_dir meant?"),
+        ("trainer.maxsteps=3", "is trainer.max_steps meant?"),
+        ("nothing.like.it=3", "there is no setting nothing.like.it: --cfg job lists all"),
         ("seed", "key=value"),
         ("resume=elsewhere.ckpt", "give resume=auto"),
         ("schedule.joint.steps=3", "schedule.joint.steps=3 is called schedule.stage2.steps=3 now"),
@@ -96,3 +151,24 @@ def test_compose_is_what_the_command_line_would_compose():
 )
 def test_words_without_a_key_get_one(typed, meant):
     assert name_positional(typed, "file") == meant
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        ("up=0.1,0.2,0.97", "up=[0.1,0.2,0.97]"),
+        ("up=-1e-3, +2, .5", "up=[-1e-3, +2, .5]"),
+        ("intrinsics=500,501.5,320,240", "intrinsics=[500,501.5,320,240]"),
+        *(
+            (same, same)
+            for same in ("up=+y", "up=-z,+y", "up=[0,0,1]", "up=auto", "num_views=4,8", "seed=1,2")
+        ),
+    ],
+)
+def test_numbers_that_are_one_value_are_no_sweep(typed, meant):
+    assert with_number_lists(["scene=a,b", typed]) == ["scene=a,b", meant]
+
+
+def test_a_direction_as_typed_reaches_the_command():
+    cfg = compose("predict", ["scene=a", "output=b", *with_number_lists(["up=0.1,-0.2,+1"])])
+    assert list(cfg.up) == [0.1, -0.2, 1]

@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
+import shutil
+
 import pytest
 
-from raytran.errors import ConfigError
-from raytran.run.output import replaced_folder
+from raytran.errors import ConfigError, DataError
+from raytran.run.output import one_writer, replaced_folder
 
 
 def fill(folder, text: str) -> None:
@@ -43,3 +45,45 @@ def test_foreign_folders_and_files_are_safe(tmp_path):
         ):
             pass
     assert (tmp_path / "thesis.tex").exists()
+
+
+@pytest.mark.parametrize("name", ["result", "x" * 250, "ü ,=(2)"])
+def test_a_folder_has_one_writer_and_the_other_is_told_which(tmp_path, name):
+    folder = tmp_path / "deep" / name
+    with one_writer(folder, marker="scene.json"):
+        with pytest.raises(ConfigError) as raised, one_writer(folder, marker="scene.json"):
+            pass
+        fill(folder, "first")
+        with one_writer(folder.with_name("another"), marker="scene.json"):
+            pass
+    assert str(raised.value).startswith(f"another process writes {folder} (number ")
+    with one_writer(folder, marker="scene.json"):
+        pass
+    assert [path.name for path in folder.parent.iterdir()] == [name]
+
+
+def test_a_writer_does_not_begin_over_something_foreign(tmp_path):
+    (tmp_path / "thesis.tex").touch()
+    with pytest.raises(ConfigError, match="no earlier result"), one_writer(tmp_path, marker="scene.json"):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_of_two_results_at_once_the_last_one_stays_whole(tmp_path):
+    folder = tmp_path / "result"
+    with replaced_folder(folder, marker="scene.json") as first:
+        (first / "scene.json").write_text("first")
+        (first / "only_of_the_first").touch()
+        fill(folder, "second")
+    assert sorted(path.name for path in folder.iterdir()) == ["only_of_the_first", "scene.json"]
+    assert [path.name for path in tmp_path.iterdir()] == ["result"]
+
+
+def test_a_folder_removed_meanwhile_is_one_sentence(tmp_path):
+    def write():
+        with replaced_folder(tmp_path / "deep" / "result", marker="scene.json") as fresh:
+            shutil.rmtree(tmp_path / "deep")
+            (fresh / "scene.json").write_text("")
+
+    with pytest.raises(DataError, match="deep was removed while result was written"):
+        write()

@@ -5,6 +5,7 @@ import json
 import pickle
 import tracemalloc
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,7 @@ from raytran.viewer.data import (
 )
 
 from ..factories import make_model, make_views
+from .conftest import make_views as make_room_views
 from .conftest import write_result
 
 
@@ -107,6 +109,26 @@ def test_a_result_comes_back_as_it_was_written(result):
     assert len(scene.truth) == 6
     assert [error.found for error in scene.errors] == [True, *[False] * 5]
     assert [error.translation for error in scene.errors] == pytest.approx([0.0, *[0.3] * 5], abs=1e-6)
+
+
+def test_pictures_of_filled_up_frames_come_back(tmp_path):
+    folder, views = write_result(tmp_path / "room"), make_room_views(5, (48, 64))
+    assert read_viewer_scene(folder).cameras.picture is None
+    picture = torch.tensor([14.0, 0.0, 50.0, 48.0]).repeat(1, 5, 1)
+    write_viewer_data(folder, replace(views, picture=picture), list("abcde"), volumes=[])
+    scene = read_viewer_scene(folder)
+    assert torch.equal(scene.cameras.picture, picture[0].double())
+    assert scene.camera(2).picture.tolist() == [14, 0, 50, 48]
+
+
+def test_a_voxel_of_a_filled_up_frame_reads_nothing_beside_its_picture(model):
+    views = make_views(1, 3)
+    part = replace(views, picture=torch.tensor([16.0, 0.0, 32.0, 32.0]).repeat(1, 3, 1))
+    (volume,) = predicted_volumes(model, part, *predict(model, part), grid_extent=model.grid_extent)
+    read = np.diff(volume.reads.offsets).reshape(model.grid_resolution) > 0
+    assert np.array_equal(volume.view_count.numpy() > 0, read)
+    columns = [volume.reads.of_voxel(v).column for v in np.flatnonzero(read.ravel())]
+    assert set(np.concatenate(columns).tolist()) == {1}
 
 
 def test_a_voxel_names_the_pixels_that_read_it(result):

@@ -216,8 +216,8 @@ class Backbone(VoxelBackbone):
         super().__init__(encoder=encoder, channels=channels)
         if channels % num_heads or num_blocks < 1:
             raise ConfigError(
-                "backbone needs channels divisible by num_heads and a block at least, got "
-                f"channels={channels}, num_heads={num_heads}, num_blocks={num_blocks}"
+                "backbone needs channels divisible by num_heads and num_blocks of at least 1, got "
+                f"{channels} channels, {num_heads} heads, {num_blocks} blocks"
             )
         self.bidirectional = bidirectional
         self.checkpoint_blocks = checkpoint_blocks

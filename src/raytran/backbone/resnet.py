@@ -108,7 +108,8 @@ class ResNet18(ImageEncoder):
         if weights is not None:
             if width != 64:
                 raise ConfigError(
-                    f"pretrained weights need resnet width 64, got {width}: set weights=null or width=64"
+                    f"pretrained weights need resnet width 64, got {width}: "
+                    "set model.backbone.encoder.width=64, or model.backbone.encoder.weights=null"
                 )
             self._load(weights)
 
@@ -146,7 +147,7 @@ def _fetch_imagenet() -> dict[str, Tensor]:
     except (URLError, OSError, RuntimeError) as error:
         raise CheckpointError(
             f"could not fetch the ImageNet weights ({error}): download {IMAGENET_URL} and put it at "
-            f"{folder / name}, or set weights to its path, or weights=null for a random start"
+            f"{folder / name}, or start at random with model.backbone.encoder.weights=null"
         ) from error
 
 

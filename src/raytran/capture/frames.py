@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import ndimage
 
+from raytran.data.images import UNREADABLE, open_image
 from raytran.data.scan import OpenScan
 from raytran.data.scannet.scan import Scan, SensScan
 from raytran.errors import DataError
@@ -19,6 +20,8 @@ from raytran.limits import MAX_SIDE
 
 _DEPTH_STEPS = 1000.0
 """Steps of ScanNet's exported depth maps in a metre."""
+
+_DEPTH_KINDS = ("PNG", "PPM")
 
 _BLUR_WIDTH = 240
 """Columns of the images whose sharpness is measured: a network whose cells are 16 pixels wide sees no finer
@@ -36,7 +39,7 @@ class RawScan:
     Attributes:
         scan: the open scan, which must stay open.
         stored: ``(n, 4, 4)`` float64, the matrices of the pose files.
-        intrinsics: ``(3, 3)`` float64, as stored.
+        intrinsics: ``(n, 3, 3)`` float64, as stored.
         axis_alignment: ``(4, 4)`` float64, aligned_from_world; identity if the scan has none.
     """
 
@@ -67,12 +70,12 @@ class RawScan:
             path = _depth_path(self.scan, frame)
             if path is None:
                 return None
-            with Image.open(path) as image:
+            with open_image(path, kinds=_DEPTH_KINDS) as image:
                 if max(image.size) > MAX_SIDE:
                     return None
                 depth = np.asarray(image, dtype=np.float64) / _DEPTH_STEPS
             return depth if depth.ndim == 2 else None
-        except (DataError, OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+        except (DataError, *UNREADABLE):
             return None
 
     def frames_with_depth(self) -> list[int]:
@@ -124,8 +127,18 @@ def blurred_frames(scan: OpenScan, frames: Sequence[int]) -> NDArray[np.bool_]:
     """
     if not len(frames):
         return np.zeros(0, dtype=np.bool_)
-    values = np.array([sharpness(read_grey(scan, frame, _BLUR_WIDTH)[0]) for frame in frames])
+    values = np.array(
+        [sharpness(_shown(scan, frame, *read_grey(scan, frame, _BLUR_WIDTH))) for frame in frames]
+    )
     return values < _BLURRED * np.median(values)
+
+
+def _shown(scan: OpenScan, frame: int, grey: NDArray[np.float32], factor: float) -> NDArray[np.float32]:
+    """Return the part of a grey image that a frame shows, without what fills it up."""
+    if scan.picture is None:
+        return grey
+    left, top, right, bottom = (scan.picture[frame] * factor).round().long().tolist()
+    return grey[top:bottom, left:right]
 
 
 def _depth_path(scan: OpenScan, frame: int) -> Path | None:

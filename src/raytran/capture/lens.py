@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lenses: COLMAP's models of distortion, and resampling the images of all lenses to one pinhole camera.
+"""Lenses: COLMAP's models of distortion, and resampling the images of a lens to those of a pinhole camera.
 
 Distortion is computed by pycolmap (extra ``colmap``), which knows every model of COLMAP, fisheyes among them.
 A camera without distortion needs no extra.
@@ -13,7 +13,6 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,24 +21,38 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from raytran.data.images import is_turned
+from raytran.data.scan import TURNED
 from raytran.errors import ConfigError, DataError
+from raytran.geometry.camera import FARTHEST_CENTER, center_offset, other_image_size
 from raytran.limits import FOCAL_LENGTH, MAX_SIDE
 
 _SAME_PX = 0.25
 """Largest shift of a pixel for which an image is used without resampling, pixels."""
 
-_SAME_FOCAL = 0.1
-"""Largest relative difference between the focal lengths of one recording; autofocus moves them by 2 %."""
-
-_SAME_ASPECT = 0.01
-_OFF_CENTER = 0.15
-"""Largest distance of the principal point from the image centre, in widths or heights."""
-
 _MAX_ZOOM = 1.5
+"""Largest zoom that leaves no corner of a straightened image empty; lenses that need more are none."""
+
+_SHORTEST, _LONGEST = 0.02, 1000.0
+"""Focal lengths in widths and heights of the image between which those of lenses lie: angles of view of 175°
+and of 3 minutes of arc."""
 
 _PINHOLES = ("PINHOLE", "SIMPLE_PINHOLE")
 _PINHOLE_AT_ZERO = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION")
 """Models that are a pinhole when all their coefficients are zero."""
+
+
+class UnfitLens(DataError):
+    """What a file says is no lens of its image.
+
+    Args:
+        message: the sentence for a user who has no other frame.
+        reason: in a few words, for the list of frames that are left out.
+    """
+
+    def __init__(self, message: str, reason: str) -> None:
+        super().__init__(message)
+        self.reason = reason
 
 
 @dataclass(frozen=True)
@@ -211,88 +224,128 @@ def check_lens(lens: Lens, where: str) -> Lens:
 
     Raises:
         ConfigError: it distorts and pycolmap is not installed.
-        DataError: sizes or focal lengths are not positive, numbers are not finite, the image is larger than
-            ``MAX_SIDE``, the principal point is far off the centre, or the distortion folds the image.
+        UnfitLens: sizes or focal lengths are not positive, numbers are not finite, the image is larger than
+            ``MAX_SIDE``, focal lengths are those of no lens, the principal point is farther from the middle
+            than ``FARTHEST_CENTER``, or the distortion folds the image or moves its corners out of it.
     """
+    fault = _fault(lens)
+    if fault is not None:
+        message, reason = fault
+        raise UnfitLens(message.format(where=where), reason)
+    return lens
+
+
+@lru_cache(maxsize=4096)
+def _fault(lens: Lens) -> tuple[str, str] | None:
+    """Return why a lens is none: a sentence with a place for its name, and a few words."""
     numbers = (*lens.focal, *lens.center, *lens.distortion, lens.radial_8)
     if not (np.abs(numbers) <= FOCAL_LENGTH.high).all() or min(lens.focal) < FOCAL_LENGTH.low:
-        raise DataError(f"{where} has no positive, finite focal lengths and centre: calibrate it again")
+        return (
+            "{where} has no positive, finite focal lengths and centre: calibrate it again",
+            "focal lengths and centre not positive and finite",
+        )
     height, width = lens.size
     if not (0 < height <= MAX_SIDE and 0 < width <= MAX_SIDE):
-        raise DataError(
-            f"{where} is for images of {width}x{height}, and 1 to {MAX_SIDE} pixels a side are read: "
-            "shrink the images, and the intrinsics with them"
+        return (
+            f"{{where}} is for images of {width}x{height}, and 1 to {MAX_SIDE} pixels a side are read: "
+            "shrink the images, and the intrinsics with them",
+            f"intrinsics for images that have not 1 to {MAX_SIDE} pixels a side",
         )
-    off = max(abs(lens.center[0] / width - 0.5), abs(lens.center[1] / height - 0.5))
-    if off > _OFF_CENTER:
-        raise DataError(
-            f"{where} has its principal point at ({lens.center[0]:.1f}, {lens.center[1]:.1f}), far from the "
-            f"middle of {width}x{height}: give the intrinsics of the stored images"
+    fx, fy = lens.focal
+    if min(fx / width, fy / height) < _SHORTEST or max(fx / width, fy / height) > _LONGEST:
+        return (
+            f"{{where}} has focal lengths of {fx:.4g} and {fy:.4g} pixels for images of {width}x{height}, as "
+            "no lens has: calibrate it again",
+            "focal lengths that no lens has",
         )
-    if not lens.is_pinhole and _folds(lens):
-        raise DataError(
-            f"the distortion of {where} folds the image onto itself: calibrate it again, or undistort the "
-            "images (COLMAP: image_undistorter)"
+    if center_offset(lens.center, lens.size) > FARTHEST_CENTER:
+        return (
+            f"{{where}} has its principal point at ({lens.center[0]:.1f}, {lens.center[1]:.1f}), far outside "
+            f"of {width}x{height}: give the intrinsics of the stored images",
+            "principal point far outside of the image",
         )
-    return lens
+    if lens.is_pinhole:
+        return None
+    if _folds(lens):
+        return (
+            "the distortion of {where} folds the image onto itself: calibrate it again, or undistort the "
+            "images (COLMAP: image_undistorter)",
+            "distortion that folds the image",
+        )
+    if _zoomed(lens) is None:
+        return (
+            f"the distortion of {{where}} moves the corners out of the image, {_MAX_ZOOM} times as far from "
+            "its middle and more, as no lens does: calibrate it again",
+            "distortion that moves the corners out of the image",
+        )
+    return None
 
 
 def _folds(lens: Lens) -> bool:
     """Whether two points on one ray from the centre, within the image, would be seen at the same place."""
     height, width = lens.size
-    corner = float(np.hypot(width / lens.focal[0], height / lens.focal[1])) / 2
+    (fx, fy), (cx, cy) = lens.focal, lens.center
+    corner = float(np.hypot(max(cx, width - cx) / fx, max(cy, height - cy) / fy))
     angle = np.arange(8) * np.pi / 4
     direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)[:, None]
-    radius = np.linspace(0, corner, 65)[:, None]
-    # (8, 65): how far from the centre each point is seen, measured along its direction.
+    radius = np.linspace(0, corner, 129)[:, None]
+    # (8, 129): how far from the centre each point is seen, measured along its direction.
     seen = (lens.distort(direction * radius) * direction).sum(axis=-1)
     # NaN, where the model has no image, is not greater than zero either.
     return not bool((np.diff(seen, axis=1) > 0).all())
 
 
-def shared_pinhole(lenses: Sequence[Lens], where: Path) -> Lens:
-    """Return the pinhole camera to which the images of all lenses are resampled.
+def pinhole_of(lens: Lens) -> Lens:
+    """Return the pinhole camera to which the images of a lens are resampled.
 
-    It has the most frequent image size and the median focal length and centre; if lenses distort it is zoomed
-    until no image leaves a corner empty.
+    It has the lens's focal length and centre; if the lens distorts it is zoomed until no corner stays empty.
 
     Args:
-        lenses: one per frame.
-        where: file to name in the message.
+        lens: one that ``check_lens`` accepts.
 
     Raises:
-        DataError: the lenses are too different to be of one camera.
+        ConfigError: it distorts and pycolmap is not installed.
     """
-    sizes = [lens.size for lens in lenses]
-    size = max(sorted(set(sizes)), key=sizes.count)
-    numbers = np.array([(*lens.focal, *lens.center) for lens in (lens.scaled_to(size) for lens in lenses)])
-    median = np.median(numbers, axis=0)
-    focal_error = np.abs(numbers[:, :2] / median[:2] - 1).max(axis=1)
-    aspect_error = np.abs(np.array([(s[1] / s[0]) / (size[1] / size[0]) for s in sizes]) - 1)
-    if focal_error.max() > _SAME_FOCAL or aspect_error.max() > _SAME_ASPECT:
-        error = aspect_error if aspect_error.max() > _SAME_ASPECT else focal_error
-        other = int(error.argmax())
-        raise DataError(
-            f"{where} has images of different cameras, {size[1]}x{size[0]} with a focal length of "
-            f"{median[0]:.0f} pixels and {sizes[other][1]}x{sizes[other][0]} with "
-            f"{lenses[other].focal[0]:.0f}: give the images of one camera, held one way, at a time"
-        )
-    fx, fy, cx, cy = (float(value) for value in median)
-    pinhole = Lens(size, (fx, fy), (cx, cy))
-    different = set(lenses)
-    for zoom in np.arange(1.0, _MAX_ZOOM, 0.01).tolist():
-        zoomed = replace(pinhole, focal=(fx * zoom, fy * zoom))
-        if all(_fills(lens, zoomed) for lens in different):
-            return zoomed
-    return pinhole
+    return lens if lens.is_pinhole else _zoomed(lens) or Lens(lens.size, lens.focal, lens.center)
+
+
+@lru_cache(maxsize=4096)
+def _zoomed(lens: Lens) -> Lens | None:
+    """Return the widest pinhole all of whose image the lens shows; None if it takes ``_MAX_ZOOM`` or more."""
+    fx, fy = lens.focal
+    zoomed = (
+        Lens(lens.size, (fx * z, fy * z), lens.center) for z in np.arange(1.0, _MAX_ZOOM, 0.01).tolist()
+    )
+    return next((pinhole for pinhole in zoomed if _fills(lens, pinhole)), None)
+
+
+def center_fault(lens: Lens, where: str) -> UnfitLens | None:
+    """Return why the principal point shows that intrinsics are of other images, or None.
+
+    Only where most images of a scan have it far from the middle: of a few it is a crop, or wanders.
+
+    Args:
+        lens: a camera.
+        where: name of the camera in the message.
+    """
+    (cx, cy), (height, width) = lens.center, lens.size
+    stated = other_image_size(lens.center, lens.size)
+    if stated is None:
+        return None
+    turned = ", turned by 90°" if is_turned(stated, lens.size) else ""
+    return UnfitLens(
+        f"{where} has its principal point at ({cx:.1f}, {cy:.1f}), the middle of {stated[1]}x{stated[0]}"
+        f"{turned} and far from that of {width}x{height}: give the intrinsics of the stored images",
+        TURNED if turned else "intrinsics for images of another size",
+    )
 
 
 def needs_resampling(lens: Lens, pinhole: Lens) -> bool:
-    """Whether a lens's images differ from those of a pinhole camera."""
+    """Whether a lens's images differ from those of a pinhole camera of the same image size."""
     if lens == pinhole:
         return False
     border = _border(pinhole.size)
-    shift = lens.scaled_to(pinhole.size).image_of(pinhole, border) - border
+    shift = lens.image_of(pinhole, border) - border
     return not float(np.abs(shift).max()) <= _SAME_PX
 
 

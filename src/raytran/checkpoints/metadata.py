@@ -6,6 +6,7 @@ from __future__ import annotations
 import copy
 import os
 import platform
+import shlex
 import subprocess
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -105,9 +106,9 @@ class DataIdentity:
         return Path(self.root).resolve() == Path(other.root).resolve()
 
     def typed(self) -> str:
-        """Return the settings that choose the data."""
+        """Return the settings that choose the data, as one types them into a shell."""
         words = [f"data={self.name}" if self.name else "", f"data.root={self.root}" if self.root else ""]
-        return " ".join(word for word in words if word)
+        return " ".join(shlex.quote(word) for word in words if word)
 
     def __str__(self) -> str:
         return " in ".join(word for word in (self.name, self.root) if word) or "unknown data"

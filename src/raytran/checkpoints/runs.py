@@ -15,7 +15,8 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from raytran.data.files import exclusive_lock, write_json
+from raytran.data.files import write_json
+from raytran.data.locks import exclusive_lock
 from raytran.data.text import as_name, read_json_object
 from raytran.errors import CheckpointError, ConfigError, DataError, RaytranError
 from raytran.limits import MAX_STEPS, as_count
@@ -61,8 +62,11 @@ def one_at_a_time(folder: Path) -> Iterator[int]:
     Raises:
         ConfigError: one does already.
     """
-    busy = ConfigError(f"another process trains in {folder}: wait for it to end, or stop it, and try again")
-    with exclusive_lock(folder / _LOCK, if_taken=busy) as descriptor:
+
+    def taken(who: str) -> ConfigError:
+        return ConfigError(f"another process trains in {folder} ({who}): wait for it to end, or stop it")
+
+    with exclusive_lock(folder / _LOCK, if_taken=taken) as descriptor:
         yield descriptor
 
 

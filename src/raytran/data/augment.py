@@ -60,11 +60,11 @@ class Augmentation:
         for name in ("yaw_deg", "mirror", "brightness", "contrast", "saturation", "hue_deg", "frame_dropout"):
             value, largest = getattr(self, name), 180 if name.endswith("_deg") else 1
             if not 0 <= value <= largest:
-                raise ConfigError(f"augmentation.{name}={value}: choose from 0 to {largest}")
+                raise ConfigError(f"data.augmentation.{name}={value}: choose from 0 to {largest}")
         shift = tuple(self.shift) if isinstance(self.shift, Sequence) else ()
         if len(shift) != 3 or not all(0 <= length < math.inf for length in shift):
             raise ConfigError(
-                f"augmentation.shift={self.shift}: give three lengths in metres, none of them negative"
+                f"data.augmentation.shift={self.shift}: give three lengths in metres, none of them negative"
             )
         object.__setattr__(self, "shift", shift)
 
@@ -158,11 +158,15 @@ def mirror_scene(scene: SceneBatch) -> SceneBatch:
     intrinsics = views.intrinsics.clone()
     intrinsics[..., 0, 1] *= -1
     intrinsics[..., 0, 2] = width - intrinsics[..., 0, 2]
+    picture = views.picture
+    if picture is not None:
+        left, top, right, bottom = picture.unbind(dim=-1)
+        picture = torch.stack([width - right, top, width - left, bottom], dim=-1)
     mirror = _in_identity(_MIRROR, 4)
     pose = _product(mirror, views.world_from_camera, mirror)
     return _changed(
         scene,
-        views=Views(views.images.flip(-1), intrinsics, pose),
+        views=Views(views.images.flip(-1), intrinsics, pose, picture),
         grid_center=_product(_MIRROR, scene.grid_center[..., None])[..., 0],
         change=_mirrored,
         foreground=None if scene.foreground is None else scene.foreground.flip(-1),

@@ -76,7 +76,7 @@ class MaskCache:
         except OSError as error:
             raise DataError(
                 f"cannot write to the cache of training targets at {self._folder} ({error.strerror}): "
-                "make room there or choose another cache_dir"
+                "make room there, or choose another folder with data.dataset.cache_dir="
             ) from error
 
     def _path(self, kind: str, key: str) -> Path:

@@ -47,7 +47,20 @@ def _join_views(parts: Sequence[Views]) -> Views:
         images=torch.cat([views.images for views in parts]),
         intrinsics=torch.cat([views.intrinsics for views in parts]),
         world_from_camera=torch.cat([views.world_from_camera for views in parts]),
+        picture=_join_pictures(parts),
     )
+
+
+def _join_pictures(parts: Sequence[Views]) -> Tensor | None:
+    """Return the pictures of all views, None if each image is all picture."""
+    if all(views.picture is None for views in parts):
+        return None
+    pictures = []
+    for views in parts:
+        height, width = views.image_size
+        whole = views.intrinsics.new_tensor([0.0, 0.0, width, height])
+        pictures.append(whole.expand(*views.images.shape[:2], 4) if views.picture is None else views.picture)
+    return torch.cat(pictures)
 
 
 def _join(tensors: Sequence[Tensor | None]) -> Tensor | None:

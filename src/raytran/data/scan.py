@@ -6,7 +6,8 @@ from __future__ import annotations
 import logging
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -19,15 +20,40 @@ from torch import Tensor
 
 from raytran.data.images import MIN_VIEWS, read_frames
 from raytran.data.views import choose_even
+from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
 from raytran.structs import Views
 
 _log = logging.getLogger(__name__)
 
-LOST = "pose is not finite or no rigid motion"
+LOST = "pose is not finite or out of bounds"
+EMPTY = "pose is all zeros"
+LEFT_HANDED = "left-handed pose (determinant −1)"
+SCALED = "rotation scaled by"
+SKEWED = "pose is no rigid motion"
+NO_MATRIX = "no camera-to-world matrix of numbers"
 NO_IMAGE = "no image"
+NEEDS_HEIF = "HEIC image, which pillow-heif decodes"
 NO_POSE = "no pose"
-"""Reasons why a frame is dropped."""
+OTHER_SHAPE = "image of another shape than its intrinsics are for"
+TURNED = "image turned by 90° against its intrinsics"
+"""Reasons why a frame is dropped; ``SCALED`` is followed by the scale."""
+
+_REMEDIES = {
+    LOST: "tracking was lost in all of them, so record or reconstruct again",
+    EMPTY: "tracking was lost in all of them, so record or reconstruct again",
+    LEFT_HANDED: "one axis is mirrored, so negate that row (of the world) or column (of the camera) of each",
+    SCALED: "divide the upper left 3x3 of each by it, and the positions too if the world was scaled with it",
+    SKEWED: "write camera-to-world matrices whose upper left 3x3 is a rotation",
+    NO_MATRIX: "give each image a text file of its name with the 16 numbers of a 4x4 matrix",
+    NO_POSE: "give each image a pose under its name",
+    NEEDS_HEIF: "pip install 'raytran[heic]', or export the images as JPEG",
+    NO_IMAGE: "check that its images lie beside it under the names it gives",
+}
+"""What to do if no frame is left, by the most frequent reason."""
+
+_ROWS, _EXAMPLES = 12, 3
+"""Reasons that are listed, and names for each."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,8 +64,10 @@ class OpenScan(ABC):
         scene_id: e.g. ``scene0470_00``.
         frame_id: name of each usable frame, in the order of the numbers in it.
         world_from_camera: ``(n, 4, 4)`` float64, metres.
-        intrinsics: ``(3, 3)`` float64 for images of the stored size, pixels.
-        image_size: ``(H, W)`` as stored.
+        intrinsics: ``(n, 3, 3)`` float64 of each frame, for images of ``image_size``, pixels.
+        image_size: ``(H, W)`` as most frames are stored; the others are brought to it.
+        picture: ``(n, 4)`` float64 left, top, right and bottom of what a frame shows within an image of
+            ``image_size``, pixels; around it the image is filled up. None: every image is all picture.
         axis_alignment: ``(4, 4)`` float64, aligned_from_world; identity if the scan has none.
         dropped: reason for each frame that was left out, by frame name.
         damage: a sentence about a file that ends early, or None.
@@ -52,6 +80,7 @@ class OpenScan(ABC):
     image_size: tuple[int, int]
     axis_alignment: Tensor
     dropped: dict[str, str]
+    picture: Tensor | None = None
     damage: str | None = None
 
     def __len__(self) -> int:
@@ -66,13 +95,18 @@ class OpenScan(ABC):
         self.close()
 
     @property
+    def cameras(self) -> Cameras:
+        """The cameras of all usable frames, ``(n,)``, for images of ``image_size``."""
+        return Cameras(self.intrinsics, self.world_from_camera, self.image_size, self.picture)
+
+    @property
     @abstractmethod
     def path(self) -> Path:
         """Folder or file that it is read from."""
 
     @abstractmethod
     def color_bytes(self, index: int) -> bytes | None:
-        """Return usable frame ``index`` as stored, if that is a JPEG or PNG, else None.
+        """Return usable frame ``index`` as stored, if it is a JPEG or PNG that is used as it is, else None.
 
         Raises:
             DataError: it cannot be read.
@@ -83,7 +117,7 @@ class OpenScan(ABC):
         """Return ``(H, W, 3)`` RGB of usable frame ``index``, resized to ``image_size`` if given.
 
         Raises:
-            DataError: the image is damaged or of another size than ``self.image_size``.
+            DataError: the image is damaged or of another size than it had when the scan was opened.
         """
 
     @abstractmethod
@@ -113,11 +147,43 @@ def even_views(
 
 
 def report_dropped(scan: OpenScan) -> None:
-    """Log how many frames of a scan have no image or pose."""
-    if scan.dropped:
-        total = len(scan) + len(scan.dropped)
-        reasons = ", ".join(sorted(set(scan.dropped.values())))
-        _log.info("%s: dropped %d of %d frames (%s)", scan.scene_id, len(scan.dropped), total, reasons)
+    """Log a table of the frames of a scan that were left out: how many, why, and some of their names."""
+    if not scan.dropped:
+        return
+    by_reason: defaultdict[str, list[str]] = defaultdict(list)
+    for name, reason in scan.dropped.items():
+        by_reason[reason].append(name)
+    ordered = sorted(by_reason.items(), key=lambda item: (-len(item[1]), item[0]))
+    shown, rest = ordered[:_ROWS], ordered[_ROWS:]
+    rows = [
+        (str(len(names)), reason, ", ".join(names[:_EXAMPLES]) + (", …" if len(names) > _EXAMPLES else ""))
+        for reason, names in shown
+    ]
+    if rest:
+        rows.append((str(sum(len(names) for _, names in rest)), f"{len(rest)} more reasons", ""))
+    wide, long = (max(len(row[column]) for row in rows) for column in (0, 1))
+    lines = [f"  {count:>{wide}}  {reason:<{long}}  {names}".rstrip() for count, reason, names in rows]
+    total = len(scan) + len(scan.dropped)
+    head = f"{scan.scene_id}: left out {len(scan.dropped)} of {total} frames"
+    _log.info("%s", "\n".join([head, *lines]))
+
+
+def none_usable(where: Path, dropped: Mapping[str, str]) -> DataError:
+    """Return the error for a scan of which no frame is left, which names the commonest reason and its remedy.
+
+    Args:
+        where: the scan.
+        dropped: reason for each frame.
+    """
+    counts = Counter(dropped.values()).most_common()
+    reasons = ", ".join(f"{count} {reason}" for reason, count in counts[:3])
+    more = f", {len(counts) - 3} more reasons" if len(counts) > 3 else ""
+    common = counts[0][0] if counts else NO_IMAGE
+    remedy = next((text for reason, text in _REMEDIES.items() if common.startswith(reason)), None)
+    return DataError(
+        f"none of the {len(dropped)} frames of {where} has an image and a valid pose ({reasons}{more}): "
+        f"{remedy or 'export it again'}"
+    )
 
 
 def scan_views(
@@ -144,9 +210,12 @@ def scan_views(
         where=scan.path,
         min_views=min_views,
     )
-    pose = scan.world_from_camera[used]
-    cameras = Cameras(scan.intrinsics.expand(len(used), 3, 3), pose, scan.image_size).scaled_to(image_size)
-    return Views(images[None], cameras.intrinsics.float()[None], pose.float()[None]), used
+    cameras = scan.cameras[used].scaled_to(image_size).to(torch.float32)[None]
+    picture = cameras.picture
+    if picture is not None and bool((picture == picture.new_tensor([0, 0, *image_size[::-1]])).all()):
+        # None of the frames that are filled up was chosen.
+        picture = None
+    return Views(images[None], cameras.intrinsics, cameras.world_from_camera, picture), used
 
 
 def _as_tensor(image: NDArray[np.uint8]) -> Tensor:

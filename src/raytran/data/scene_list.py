@@ -34,7 +34,7 @@ def choose_scenes(
     """
     if not scans_root.is_dir():
         raise DataError(f"there is no folder {scans_root}: prepare the data set or mend its path")
-    present = {path.name for path in scans_root.iterdir() if path.is_dir()}
+    present = {p.name for p in scans_root.iterdir() if p.is_dir() and not p.name.startswith(".")}
     if wanted is None:
         wanted = sorted(present if annotations is None else present & set(annotated(annotations)))
         if not wanted:

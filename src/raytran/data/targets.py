@@ -206,15 +206,12 @@ def _cached_per_camera(
     draw: Callable[[Cameras], NDArray[np.bool_]],
 ) -> Tensor:
     """Return an array for each of N cameras, ``(N, *shape)``; ``draw`` makes those that the cache lacks."""
-    intrinsics, world_from_camera = cameras.intrinsics.numpy(), cameras.world_from_camera.numpy()
-    keys = [
-        digest(scene_key, cameras.image_size, *camera)
-        for camera in zip(intrinsics, world_from_camera, strict=True)
-    ]
+    facts = [cameras.intrinsics.numpy(), cameras.world_from_camera.numpy()]
+    facts += [] if cameras.picture is None else [cameras.picture.numpy()]
+    keys = [digest(scene_key, cameras.image_size, *camera) for camera in zip(*facts, strict=True)]
     arrays, missing = cache.read_stack(kind, keys, shape)
     if missing:
-        chosen = Cameras(cameras.intrinsics[missing], cameras.world_from_camera[missing], cameras.image_size)
-        arrays[missing] = draw(chosen)
+        arrays[missing] = draw(cameras[missing])
         for i in missing:
             cache.write(kind, keys[i], arrays[i])
     return torch.from_numpy(arrays)
@@ -229,7 +226,7 @@ def _scan_surface(path: Path, _content: str) -> tuple[NDArray, NDArray]:
     """
     try:
         with np.errstate(all="ignore"):  # what numbers there are is looked at below
-            mesh = trimesh.load(path, process=False)
+            mesh = trimesh.load(path, process=False, skip_materials=True)
     except Exception as error:  # a damaged file can fail anywhere in trimesh
         raise DataError(f"cannot read the mesh {path} ({str(error)[:80]!r}): copy it again") from error
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):

@@ -73,7 +73,7 @@ def read_table(path: Path, *, max_bytes: int = MAX_BYTES) -> NDArray[np.float64]
     numbers = array("d")
     width = 0
     for number, line in enumerate(io.StringIO(read_text(path, max_bytes=max_bytes), newline=None), start=1):
-        words = line.partition("#")[0].translate(_PARTED).split()
+        words = parted(line)
         try:
             numbers.extend(map(float, words))
         except ValueError as error:
@@ -82,6 +82,11 @@ def read_table(path: Path, *, max_bytes: int = MAX_BYTES) -> NDArray[np.float64]
             raise _no_row(path, number)
     table = np.array(numbers, dtype=np.float64)
     return table.reshape(-1, width) if width else table
+
+
+def parted(line: str) -> list[str]:
+    """Return the words of a line that are parted by blanks, commas or semicolons, without a comment."""
+    return line.partition("#")[0].translate(_PARTED).split()
 
 
 _PARTED = str.maketrans(",;", "  ")

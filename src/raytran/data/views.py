@@ -138,17 +138,14 @@ def near_duplicates(cameras: Cameras) -> Tensor:
 
 
 def visible_cells(cameras: Cameras, cells: Tensor) -> Tensor:
-    """Return whether each camera has each point in its image and within ``SIGHT``, ``(n, V)`` bool.
+    """Return whether each camera has each point in its picture and within ``SIGHT``, ``(n, V)`` bool.
 
     Args:
         cameras: ``(n,)``.
         cells: ``(V, 3)`` points of the world, metres.
     """
     cells = cells.to(cameras.intrinsics)
-    pixels, depth = cameras.project(cells)
-    height, width = cameras.image_size
-    inside = (pixels >= 0).all(dim=-1) & (pixels[..., 0] < width) & (pixels[..., 1] < height) & (depth > 0)
-    return inside & (torch.cdist(cameras.position, cells) < SIGHT)
+    return cameras.sees(*cameras.project(cells)) & (torch.cdist(cameras.position, cells) < SIGHT)
 
 
 def _cells(grid: VoxelGrid) -> Tensor:

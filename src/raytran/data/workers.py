@@ -7,12 +7,16 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 from itertools import islice
-from typing import TypeVar
+from types import TracebackType
+from typing import Any, TypeVar
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -21,6 +25,10 @@ from raytran.errors import DataError
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
+ENDS_WITH = "RAYTRAN_ENDS_WITH"
+"""Environment variable with the number of a process; a command that is started with it ends with that."""
+
+_POLL_SECONDS = 0.3
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
@@ -69,7 +77,7 @@ def _in_parallel(items: Sequence[Item], function: Callable[[Item], Result], work
     context = multiprocessing.get_context("spawn")
     with (
         _one_thread_each(),
-        ProcessPoolExecutor(workers, mp_context=context, initializer=_become_worker) as pool,
+        ProcessPoolExecutor(workers, mp_context=context, initializer=become_worker) as pool,
     ):
         try:
             yield from _as_completed(items, function, workers, pool)
@@ -92,17 +100,65 @@ def _as_completed(
             yield future.result()
 
 
-def _become_worker() -> None:
-    """Leave interrupts to the parent process, and end with it even if it is killed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+def become_worker() -> None:
+    """Leave interrupts to the parent process, and end with it even if it is killed.
+
+    The signals by which a run is asked to stop may reach all its processes; a run that saves itself needs its
+    workers until it has.
+    """
+    for name in ("SIGINT", "SIGUSR1"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
+    sys.excepthook = partial(_say_unless_alone, before=sys.excepthook)
+    end_with_parent()
 
 
-def _end_with_parent() -> None:
-    parent = multiprocessing.parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
+def _say_unless_alone(
+    kind: type[BaseException],
+    error: BaseException,
+    trace: TracebackType | None,
+    *,
+    before: Callable[..., Any],
+) -> None:
+    """Show an error of a thread, but not that the parent has gone in the middle of a word."""
+    if not isinstance(error, ConnectionError | EOFError):
+        before(kind, error, trace)
+
+
+def end_with_parent(last_words: str = "", *, parent: int | None = None) -> None:
+    """End this process soon after the one that has started it, however that may end.
+
+    Args:
+        last_words: a sentence to say then.
+        parent: number of the process that has started this one; it may have ended since. None: the present
+            parent.
+    """
+    parent = os.getppid() if parent is None else parent
+    watch = threading.Thread(
+        target=_watch_parent, args=(parent, last_words), name="parent-watch", daemon=True
+    )
+    watch.start()
+
+
+def _watch_parent(parent: int, last_words: str) -> None:
+    if sys.platform == "win32":  # where the number of the parent stays
+        process = multiprocessing.parent_process()
+        if process is None:
+            return
+        process.join()
+    while os.getppid() == parent and sys.platform != "win32":
+        time.sleep(_POLL_SECONDS)
+    end_now(last_words)
+
+
+def end_now(last_words: str = "") -> None:
+    """End this process and its workers at once, without waiting for any other process."""
+    if last_words:
+        sys.stderr.write(f"raytran: {last_words}\n")
+        sys.stderr.flush()
+    for worker in multiprocessing.active_children():
+        worker.kill()
+    os._exit(1)
 
 
 @contextlib.contextmanager

@@ -16,16 +16,26 @@ from numpy.typing import NDArray
 from raytran.geometry.camera import Cameras
 from raytran.structs import CLASS_COLORS, CLASSES, ObjectSet
 
-WORLD = "world_z_up"
-"""Node above all others; it turns the world's +Z to glTF's +Y."""
+ROOT = "scene_y_up"
+"""Node above all others, which leaves them where they are."""
 
 _Y_UP_FROM_Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""From the world (+Z up) to the axes of glTF and OBJ: (x, y, z) becomes (x, z, -y)."""
 
 _EDGE = 0.008
 """Thickness of a box's edges, metres; those of the front face are twice as thick."""
 
 _NEAR = 0.05
 """Near plane of the cameras, metres."""
+
+
+def turned_y_up(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return a mesh of the world (+Z up) in the axes that readers of glTF and OBJ expect (+Y up).
+
+    The vertices themselves are turned, to the last bit as they were: many readers ignore nodes.
+    """
+    vertices = np.asarray(mesh.vertices) @ _Y_UP_FROM_Z_UP[:3, :3].T + 0.0  # no -0
+    return trimesh.Trimesh(vertices, mesh.faces, process=False)
 
 
 def object_name(objects: ObjectSet, index: int) -> str:
@@ -43,10 +53,10 @@ def write_glb(
 ) -> Path:
     """Write a scene as glTF; a mesh is the node ``NN_class``, its object's box the node ``NN_class_box``.
 
-    Geometry keeps the world coordinates of the poses (+Z up); the parent node ``world_z_up`` turns them to
-    glTF's +Y up, so that every viewer shows the room upright. A box is its twelve edges as thin bars, those
-    of the front bolder. Each frame is a glTF camera in the node ``camera_FRAME`` below the node ``cameras``;
-    glTF knows no principal point, so one beside the middle of the image is lost.
+    glTF is +Y up, and so are the vertices: a point (x, y, z) of the world is (x, z, -y). The nodes of meshes
+    and boxes move nothing. A box is its twelve edges as thin bars, those of the front bolder. Each frame is a
+    glTF camera in the node ``camera_FRAME`` below the node ``cameras``; glTF knows no principal point, so one
+    beside the middle of the image is lost.
 
     Args:
         path: the file.
@@ -59,11 +69,11 @@ def write_glb(
         ``path``.
     """
     scene = trimesh.Scene()
-    scene.graph.update(frame_from=scene.graph.base_frame, frame_to=WORLD, matrix=_Y_UP_FROM_Z_UP)
+    scene.graph.update(frame_from=scene.graph.base_frame, frame_to=ROOT)
     for i, mesh in enumerate(meshes):
         label, name = int(objects.label[i]), object_name(objects, i)
         if mesh is not None:
-            _add(scene, name, trimesh.Trimesh(mesh.vertices, mesh.faces, process=False), label)
+            _add(scene, name, mesh, label)
         _add(scene, f"{name}_box", _box_edges(objects, i), label)
 
     def complete(tree: dict[str, Any]) -> None:
@@ -85,7 +95,8 @@ def _linear(color: Sequence[int]) -> list[float]:
     return [value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4 for value in values]
 
 
-def _add(scene: trimesh.Scene, name: str, solid: trimesh.Trimesh, label: int) -> None:
+def _add(scene: trimesh.Scene, name: str, mesh: trimesh.Trimesh, label: int) -> None:
+    solid = turned_y_up(mesh)
     # Its colour is set in the finished file: trimesh rounds colours to 256 steps, too few for linear light.
     material = trimesh.visual.material.PBRMaterial(
         name=CLASSES[label],
@@ -95,7 +106,7 @@ def _add(scene: trimesh.Scene, name: str, solid: trimesh.Trimesh, label: int) ->
         doubleSided=True,
     )
     solid.visual = trimesh.visual.TextureVisuals(material=material)
-    scene.add_geometry(solid, node_name=name, geom_name=name, parent_node_name=WORLD)
+    scene.add_geometry(solid, node_name=name, geom_name=name, parent_node_name=ROOT)
 
 
 def _box_edges(objects: ObjectSet, index: int) -> trimesh.Trimesh:
@@ -122,11 +133,11 @@ def _add_cameras(tree: dict[str, Any], cameras: Cameras, frame_ids: Sequence[str
     """Add a camera for each frame to glTF's JSON; a glTF camera looks along its own -Z, with +Y up."""
     height, width = cameras.image_size
     nodes: list[dict[str, Any]] = tree["nodes"]
-    world = next(node for node in nodes if node.get("name") == WORLD)
-    poses = cameras.world_from_camera.double().cpu().numpy() * np.array([1.0, -1, -1, 1])
+    root = next(node for node in nodes if node.get("name") == ROOT)
+    poses = _Y_UP_FROM_Z_UP @ cameras.world_from_camera.double().cpu().numpy() * np.array([1.0, -1, -1, 1])
     first = len(nodes) + 1
     nodes.append({"name": "cameras", "children": list(range(first, first + len(poses)))})
-    world.setdefault("children", []).append(first - 1)
+    root.setdefault("children", []).append(first - 1)
     focal = cameras.intrinsics[:, [0, 1], [0, 1]].double().tolist()
     tree["cameras"] = [
         {

@@ -41,6 +41,25 @@ ROCA_COLUMNS: tuple[str, ...] = (
 )
 """The 14 columns of ROCA's result file (vid2cad_evaluation.py)."""
 
+_SCORED = (*SCAN2CAD_COLUMNS, "score")
+_EXAMPLE = ("id_scan", *SCAN2CAD_COLUMNS)
+"""The 13 columns of Scan2CAD's own example (dummy_alignment.csv), all with score 1."""
+
+_VID2CAD = (*_EXAMPLE, "", "num_views", "score")
+"""The 16 columns of Vid2CAD's result file as ODAM reads it (eval_scan2cad.py); the 14th is not read, nor is
+the number of views."""
+
+_OF_ONE_SCAN = (SCAN2CAD_COLUMNS, _SCORED)
+_OF_MANY_SCANS = (ROCA_COLUMNS, _EXAMPLE, _VID2CAD)
+"""Columns of the files that hold the alignments of one scan, and of many."""
+
+_NOT_READ = ("", "num_views")
+_NAMES = ("id_scan", "objectCategory", "alignedModelId", "catid_cad", "id_cad")
+"""Columns that are no numbers."""
+
+_SHORT_SCAN_ID = re.compile(r"\d{4}_\d{2}")
+"""What Vid2CAD calls ``scene0470_00``."""
+
 _CATID_DIGITS = 8
 
 _UNIT_TOLERANCE = 1e-3
@@ -114,7 +133,7 @@ def read_predictions(path: Path, scene_ids: Collection[str], cad_boxes: CadBoxes
     Args:
         path: a folder of ``<scene_id>.json`` or ``<scene_id>/scene.json`` (``raytran.scene/1``) or
             ``<scene_id>.csv`` (Scan2CAD, 12 columns); or the folder of one scene, with its ``scene.json``;
-            or a CSV of ROCA's 14 columns with all scenes.
+            or a CSV with all scenes, of ROCA's 14 columns, Scan2CAD's 13 or Vid2CAD's 16.
         scene_ids: the annotated scenes; others are ignored, without being opened.
         cad_boxes: of the CAD models that the annotations name.
 
@@ -122,7 +141,7 @@ def read_predictions(path: Path, scene_ids: Collection[str], cad_boxes: CadBoxes
         DataError: nothing there is for any of the scenes, a scene occurs twice, or a file is damaged.
     """
     if path.is_file():
-        alignments = read_roca_csv(path)
+        alignments = _with_known_ids(read_roca_csv(path), scene_ids)
         ignored = tuple(alignments.keys() - set(scene_ids))
         scenes = {
             name: _from_alignments(path, alignments[name], cad_boxes)
@@ -150,6 +169,19 @@ def read_predictions(path: Path, scene_ids: Collection[str], cad_boxes: CadBoxes
             unknown,
         )
     return result
+
+
+def _with_known_ids(
+    alignments: dict[str, CadAlignments], scene_ids: Collection[str]
+) -> dict[str, CadAlignments]:
+    """Return alignments by the names of the annotated scenes: Vid2CAD leaves out their "scene"."""
+
+    def known(name: str) -> str:
+        is_short = _SHORT_SCAN_ID.fullmatch(name) and name not in scene_ids and f"scene{name}" in scene_ids
+        return f"scene{name}" if is_short else name
+
+    renamed = {known(name): cads for name, cads in alignments.items()}
+    return renamed if len(renamed) == len(alignments) else alignments
 
 
 def _files_by_scene(folder: Path) -> dict[str, Path]:
@@ -337,6 +369,7 @@ def _model_id(entry: Mapping[str, Any], path: Path) -> str:
 
 class _Row(NamedTuple):
     line: int
+    scan: str
     names: list[str]
     values: list[float]
 
@@ -344,9 +377,9 @@ class _Row(NamedTuple):
 def read_alignments_csv(path: Path) -> CadAlignments:
     """Read the predictions for one scan, 12 columns a row; a header row and blank lines are skipped.
 
-    Quaternions and categories are kept as given, but one sentence warns of quaternions not of length one and
-    of categories without eight digits: the official script takes them as they are, and the latter match
-    nothing.
+    A 13th column is the score. Quaternions and categories are kept as given, but one sentence warns of
+    quaternions not of length one and of categories without eight digits: the official script takes them as
+    they are, and the latter match nothing.
 
     Args:
         path: ``<id_scan>.csv``.
@@ -355,7 +388,7 @@ def read_alignments_csv(path: Path) -> CadAlignments:
         DataError: the file cannot be read, or a row has another number of columns, a value that is no
             finite number, a quaternion of length zero or a scale that is not positive.
     """
-    rows = _read_rows(Path(path), SCAN2CAD_COLUMNS, 2)
+    rows = _read_rows(Path(path), _OF_ONE_SCAN)
     short = [row for row in rows if len(row.names[0]) != _CATID_DIGITS]
     if short:
         _log.warning(
@@ -368,7 +401,8 @@ def read_alignments_csv(path: Path) -> CadAlignments:
 def read_roca_csv(path: Path) -> dict[str, CadAlignments]:
     """Read the predictions for many scans, 14 columns a row, as ``read_alignments_csv`` does.
 
-    ROCA writes categories as numbers; they get their leading zeros back.
+    Scan2CAD's 13 columns, which have no score, and Vid2CAD's 16 are read too. ROCA writes categories as
+    numbers; they get their leading zeros back.
 
     Args:
         path: the file; the rows of a scan need not be neighbours.
@@ -380,34 +414,41 @@ def read_roca_csv(path: Path) -> dict[str, CadAlignments]:
         DataError: see ``read_alignments_csv``.
     """
     by_scene: dict[str, list[_Row]] = {}
-    for row in _read_rows(Path(path), ROCA_COLUMNS, 3):
-        scene_id, category, name = row.names
-        by_scene.setdefault(scene_id, []).append(row._replace(names=[category.zfill(_CATID_DIGITS), name]))
+    for row in _read_rows(Path(path), _OF_MANY_SCANS):
+        category, name = row.names
+        by_scene.setdefault(row.scan, []).append(row._replace(names=[category.zfill(_CATID_DIGITS), name]))
     return {scene_id: _alignments_from_rows(rows) for scene_id, rows in by_scene.items()}
 
 
-def _read_rows(path: Path, columns: tuple[str, ...], n_names: int) -> list[_Row]:
+def _read_rows(path: Path, forms: Sequence[tuple[str, ...]]) -> list[_Row]:
+    """Return the rows of a file whose columns are those of one of some forms, the same in all rows."""
     rows: list[_Row] = []
     not_unit: list[int] = []
+    columns: tuple[str, ...] | None = None
     is_first = True
     try:
-        table = list(csv.reader(read_text(path, max_bytes=_MAX_CSV).splitlines()))
+        lines = read_text(path, max_bytes=_MAX_CSV).splitlines()
+        separator = ";" if lines and "," not in lines[0] else ","  # spreadsheets write semicolons
+        table = list(csv.reader(lines, delimiter=separator))
     except csv.Error as error:
         raise DataError(f"cannot read the alignments {path} ({error}): check the path") from error
     for line, cells in enumerate(table, start=1):
         cells = [cell.strip() for cell in cells]
         if not any(cells):
             continue
-        if len(cells) != len(columns):
-            raise DataError(
-                f"{path}, line {line} has {len(cells)} columns: write the {len(columns)} columns "
-                f"{','.join(columns)}"
-            )
         is_first, may_be_header = False, is_first
-        if may_be_header and _is_header(cells[n_names:]):
+        if may_be_header and len(cells) in map(len, forms) and _is_header(cells[3:]):
             _log.warning("%s, line %d: skipped a header row", path, line)
             continue
-        row = _Row(line, cells[:n_names], _numbers(cells[n_names:], columns[n_names:], path, line))
+        columns = columns or _form_of(cells, forms)
+        if columns is None or len(cells) != len(columns):
+            wanted = columns or forms[0]
+            others = "" if columns else "".join(f" or {len(form)}" for form in forms[1:])
+            raise DataError(
+                f"{path}, line {line} has {len(cells)} columns: write the {len(wanted)} columns "
+                f"{','.join(wanted)}{others}"
+            )
+        row = _row(line, cells, columns, path)
         if abs(_checked_length(row, path) - 1) > _UNIT_TOLERANCE:
             not_unit.append(line)
         rows.append(row)
@@ -418,6 +459,36 @@ def _read_rows(path: Path, columns: tuple[str, ...], n_names: int) -> list[_Row]
             *(path, not_unit[0], len(not_unit)),
         )
     return rows
+
+
+def _form_of(cells: Sequence[str], forms: Sequence[tuple[str, ...]]) -> tuple[str, ...] | None:
+    """Return the columns of a row, None if it has those of no form.
+
+    Only the name of a category is a whole number: a row of 13 that begins with one has no name of a scan.
+    """
+    has_scan = not cells[0].isdecimal()
+    return next(
+        (
+            form
+            for form in forms
+            if len(form) == len(cells) and (len(form) != 13 or (form[0] == "id_scan") == has_scan)
+        ),
+        None,
+    )
+
+
+def _row(line: int, cells: Sequence[str], columns: tuple[str, ...], path: Path) -> _Row:
+    """Return a row of a file.
+
+    Raises:
+        DataError: a value is no finite number.
+    """
+    named = [(name, cell) for name, cell in zip(columns, cells, strict=True) if name not in _NOT_READ]
+    scan = next((cell for name, cell in named if name == "id_scan"), "")
+    names = [cell for name, cell in named if name in _NAMES and name != "id_scan"]
+    numbers = [(name, cell) for name, cell in named if name not in _NAMES]
+    values = _numbers([cell for _, cell in numbers], tuple(name for name, _ in numbers), path, line)
+    return _Row(line, scan, names, values)
 
 
 def _is_header(cells: list[str]) -> bool:

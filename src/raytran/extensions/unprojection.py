@@ -100,7 +100,7 @@ class UnprojectionBackbone(VoxelBackbone):
 
 
 def pair_centers(cameras: Cameras, grid: VoxelGrid, feature_size: tuple[int, int]) -> PairList:
-    """Join each voxel, in each view that has its centre in the image, with the cell that the centre falls on.
+    """Join each voxel, in each view with its centre in the picture, with the cell that the centre falls on.
 
     So a voxel has at most one pixel a view, whatever it covers of the image, and the mean over its pairs is
     the unprojection of ImVoxelNet (Rukhovich et al., WACV 2022).
@@ -112,8 +112,9 @@ def pair_centers(cameras: Cameras, grid: VoxelGrid, feature_size: tuple[int, int
     """
     height, width = feature_size
     centers = grid.voxel_centers().flatten(-4, -2).to(cameras.intrinsics.dtype)
-    place, depth = cameras.scaled_to(feature_size).project(centers[..., None, :, :])
-    inside = (place >= 0).all(dim=-1) & (place[..., 0] < width) & (place[..., 1] < height) & (depth > 0)
+    scaled = cameras.scaled_to(feature_size)
+    place, depth = scaled.project(centers[..., None, :, :])
+    inside = scaled.sees(place, depth)
     views, scenes = inside.flatten(0, -2), centers.flatten(0, -3).shape[0] if centers.ndim > 2 else 1
     view, voxel = views.nonzero(as_tuple=True)
     column, row = place.flatten(0, -3)[view, voxel].long().unbind(dim=-1)

@@ -123,7 +123,7 @@ class _Caster:
         self._boxes = boxes
 
     def near_pixels(self, camera: Cameras) -> Tensor:
-        """Return the pixels inside the projection of any mesh's box, ``(H, W)`` bool."""
+        """Return the pixels of the picture inside the projection of any mesh's box, ``(H, W)`` bool."""
         height, width = camera.image_size
         near = torch.zeros(height, width, dtype=torch.bool)
         for corners in self._boxes:
@@ -134,7 +134,8 @@ class _Caster:
                 left, top = (pixels.amin(dim=0).floor() - 1).clamp(min=0).long().tolist()
                 right, bottom = (pixels.amax(dim=0).ceil() + 1).clamp(min=0).long().tolist()
                 near[top:bottom, left:right] = True
-        return near
+        in_picture = camera.cells_in_picture(camera.image_size)
+        return near if in_picture is None else near & in_picture[..., 0]
 
     def cast(self, camera: Cameras, pixels: Tensor, **options: str | bool) -> NDArray | dict[str, NDArray]:
         """Cast the centre rays of ``pixels``, ``(H, W)`` bool; a ray's parameter is a depth in metres."""
@@ -151,8 +152,9 @@ class _Caster:
 
 
 def _each(cameras: Cameras) -> Iterator[Cameras]:
-    for intrinsics, world_from_camera in zip(cameras.intrinsics, cameras.world_from_camera, strict=True):
-        yield Cameras(intrinsics.double().cpu(), world_from_camera.double().cpu(), cameras.image_size)
+    exact = cameras.to(torch.float64).to("cpu")
+    for n in range(len(exact.intrinsics)):
+        yield exact[n]
 
 
 def _box_corners(low: NDArray, high: NDArray) -> NDArray:

@@ -132,7 +132,8 @@ class ObjectHead(nn.Module):
         if isinstance(queries, str):
             raise ConfigError(
                 f"model.heads.objects.queries={queries} is no module: "
-                "choose model/extensions=[proposal_queries], or queries=null for learned ones"
+                "choose model/extensions=[proposal_queries], "
+                "or model.heads.objects.queries=null for learned ones"
             )
         self.grid_extent = tuple(float(length) for length in grid_extent)
         self.register_buffer("extent", torch.tensor(self.grid_extent), persistent=False)

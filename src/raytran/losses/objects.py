@@ -47,7 +47,7 @@ class Betas(NamedTuple):
         """
         for name, beta in self._asdict().items():
             if not 0 <= beta < math.inf:
-                raise ConfigError(f"{name}_beta={beta}: give a length or an angle, at least 0")
+                raise ConfigError(f"loss.{name}_beta={beta}: give a length or an angle, at least 0")
         return Betas(float(self.center), float(self.yaw))
 
 

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from raytran.metrics.functional.alignment import SCAN2CAD_LIMITS, alignment_errors
+from raytran.metrics.functional.alignment import SCAN2CAD_LIMITS, alignment_errors, row_blocks
 from raytran.metrics.functional.detection import score_order
 from raytran.metrics.per_scene import ObjectMetric, Row, SceneRecord
 from raytran.structs import CLASSES, ObjectSet
@@ -67,9 +67,12 @@ class AccuracyCurves(ObjectMetric):
         """Match one scene at all thresholds; see the base class."""
         errors = torch.stack([*alignment_errors(predictions, targets)]).numpy()
         same_class = (predictions.label[:, None] == targets.label).numpy()
-        within = (errors <= self._limits[:, :, None, None]).all(axis=1)
-        is_found = _first_fit(same_class & within, score_order(predictions.score).tolist())
-        truths = torch.cat([targets.label[:, None].double(), torch.from_numpy(is_found.T).double()], dim=1)
+        free = np.ones((len(self._limits), len(targets)), dtype=bool)
+        order = score_order(predictions.score).numpy()
+        for part in row_blocks(len(order), free.size):
+            within = (errors[:, order[part]] <= self._limits[:, :, None, None]).all(axis=1)
+            _take_first_fit(same_class[order[part]] & within, free)
+        truths = torch.cat([targets.label[:, None].double(), torch.from_numpy(~free.T).double()], dim=1)
         return truths, predictions.label[:, None].double()
 
     def compute(self) -> dict[str, CurveResult]:
@@ -151,21 +154,17 @@ def _scaled(limit: float, factor: float) -> float:
     return float(f"{limit * factor:.12g}")
 
 
-def _first_fit(allowed: NDArray[np.bool_], order: Sequence[int]) -> NDArray[np.bool_]:
+def _take_first_fit(allowed: NDArray[np.bool_], free: NDArray[np.bool_]) -> None:
     """Give each prediction, one after another, the first free object it may take; at all thresholds at once.
 
     Args:
-        allowed: ``(T, P, M)``, whether a prediction may take an object at a threshold.
-        order: the predictions in the order in which they choose.
-
-    Returns:
-        ``(T, M)``, whether an object is taken.
+        allowed: ``(T, P, M)``, whether a prediction may take an object at a threshold, in the order in which
+            they choose.
+        free: ``(T, M)``, whether an object is free; set to False where it is taken.
     """
-    free = np.ones((allowed.shape[0], allowed.shape[2]), dtype=bool)
     every = np.arange(len(free))
-    for index in order:
+    for index in range(allowed.shape[1]):
         fits = allowed[:, index] & free
         if fits.any():
             first = fits.argmax(axis=1)
             free[every, first] &= ~fits[every, first]
-    return ~free

@@ -87,9 +87,7 @@ class OrientedBoxF1(ProtocolMetric):
             known = ", ".join(BOX_F1_PROTOCOLS)
             raise ConfigError(f"unknown protocol {protocol!r} of OrientedBoxF1, choose one of: {known}")
         if not iou_thresholds:
-            raise ConfigError(
-                "OrientedBoxF1 needs at least one IoU threshold, e.g. iou_thresholds=[0.25, 0.5]"
-            )
+            raise ConfigError("OrientedBoxF1 needs at least one IoU threshold, e.g. [0.25, 0.5]")
         self.protocol = protocol
         self.drops_missing = protocol == "odam"
         self.cad_half_extents = None if cad_half_extents is None else dict(cad_half_extents)

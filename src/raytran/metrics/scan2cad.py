@@ -218,11 +218,13 @@ def _truths(
     taken_by = torch.full((n_true,), -1)
     taker = (match >= 0).nonzero().squeeze(1)
     taken_by[match[taker]] = taker
-    values = torch.stack([*errors, score[:, None].expand_as(same_class)], dim=-1)
-    values = torch.cat([values, values.new_full((1, n_true, 4), torch.nan)])
     shown = torch.where(taken_by >= 0, taken_by, _nearest(errors.translation, same_class))
+    values = errors.translation.new_full((n_true, 4), torch.nan)
+    some = (shown >= 0).nonzero().squeeze(1)
+    of_shown = [error[shown[some], some] for error in errors]
+    values[some] = torch.stack([*of_shown, score[shown[some]]], dim=-1)
     truths = torch.stack([label, taken_by >= 0], dim=-1).double()
-    return torch.cat([truths, values[shown, torch.arange(n_true)]], dim=-1)
+    return torch.cat([truths, values], dim=-1)
 
 
 def _nearest(distance: Tensor, same_class: Tensor) -> Tensor:

@@ -52,9 +52,10 @@ def trace_pairs(
 
     A ray is inside a slab between two planes over an interval of depth, inside a voxel over the intersection
     of three of them, and the voxel counts if that is longer than ``min_depth`` metres in front of the camera.
-    A ray parallel to a slab is in it for ever or never; slabs are half-open.
+    A ray parallel to a slab is in it for ever or never; slabs are half-open. A ray outside of its camera's
+    picture is in no voxel.
     """
-    precise = Cameras(cameras.intrinsics.double(), cameras.world_from_camera.double(), cameras.image_size)
+    precise = cameras.to(torch.float64)
     directions = precise.cell_rays(feature_size, rays_per_cell)[1].flatten(0, 2)
     pixels_of_view = feature_size[0] * feature_size[1]
     device = directions.device
@@ -66,12 +67,27 @@ def trace_pairs(
     for pixel, rays in enumerate(directions):
         origin = precise.position[pixel // pixels_of_view]
         crossed = torch.zeros(len(index), dtype=torch.bool, device=device)
-        for ray in rays:
-            crossed |= _depth_inside(origin, ray, lower, upper) > min_depth
+        for number, ray in enumerate(rays):
+            if _in_picture(precise, pixel, number, feature_size, rays_per_cell):
+                crossed |= _depth_inside(origin, ray, lower, upper) > min_depth
         found = crossed.nonzero()[:, 0]
         pixels.append(torch.full_like(found, pixel))
         voxels.append(found)
     return PairList(torch.cat(pixels), torch.cat(voxels), len(directions), grid.num_voxels)
+
+
+def _in_picture(
+    cameras: Cameras, pixel: int, number: int, feature_size: tuple[int, int], rays_per_cell: int
+) -> bool:
+    """Return whether ray ``number`` of a pixel of the pair list passes through its camera's picture."""
+    if cameras.picture is None:
+        return True
+    view, cell = divmod(pixel, feature_size[0] * feature_size[1])
+    place = zip(divmod(cell, feature_size[1]), divmod(number, rays_per_cell), feature_size, strict=True)
+    row, column = (index + (part + 0.5) / rays_per_cell for index, part, _ in place)
+    v, u = row / feature_size[0] * cameras.image_size[0], column / feature_size[1] * cameras.image_size[1]
+    left, top, right, bottom = cameras.picture[view].tolist()
+    return bool(left <= u < right and top <= v < bottom)
 
 
 def _depth_inside(origin: Tensor, ray: Tensor, lower: Tensor, upper: Tensor) -> Tensor:

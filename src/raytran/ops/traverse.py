@@ -30,6 +30,10 @@ NUDGE = 1e-9
 _PARALLEL = 1e-12
 """Slopes below this, in voxels per metre of depth, count as zero."""
 
+_NO_RAY = 1e200
+"""Voxels per metre of depth, along each axis, of a ray that is none: it is through the whole grid within a
+depth far below ``NUDGE``, wherever it begins, so that nothing has to be taken out of lists of rays."""
+
 _VIEWS_AT_ONCE = 8
 """Views that are counted together."""
 
@@ -119,11 +123,11 @@ def count_views(
     """
     check_shape(cameras.intrinsics, "N 3 3", "intrinsics")
     counts = torch.zeros(grid.num_voxels, dtype=torch.int32, device=cameras.intrinsics.device)
-    some = (tensor.split(_VIEWS_AT_ONCE) for tensor in (cameras.intrinsics, cameras.world_from_camera))
-    for intrinsics, pose in zip(*some, strict=True):
-        pairs = trace_pairs(Cameras(intrinsics, pose, cameras.image_size), grid, feature_size, rays_per_cell)
+    for start in range(0, len(cameras.intrinsics), _VIEWS_AT_ONCE):
+        some = cameras[start : start + _VIEWS_AT_ONCE]
+        pairs = trace_pairs(some, grid, feature_size, rays_per_cell)
         view = pairs.pixel_index.div(feature_size[0] * feature_size[1], rounding_mode="floor")
-        met = torch.zeros(len(pose), grid.num_voxels, dtype=torch.bool, device=counts.device)
+        met = torch.zeros(len(some.intrinsics), grid.num_voxels, dtype=torch.bool, device=counts.device)
         met[view, pairs.voxel_index] = True
         counts += met.sum(dim=0, dtype=torch.int32)
     return counts.view(grid.resolution)
@@ -134,7 +138,8 @@ def voxel_rays(
 ) -> tuple[Tensor, Tensor]:
     """Return the rays of all pixels in voxel coordinates and voxels per metre of depth, float64.
 
-    Slopes and offsets from the grid's planes that are nothing but rounding are zero.
+    Slopes and offsets from the grid's planes that are nothing but rounding are zero. Rays that pass through
+    no part of the picture (``Cameras.picture``) have the direction ``_NO_RAY``, which meets no voxel.
 
     Args:
         cameras: as in ``trace_pairs``.
@@ -154,11 +159,14 @@ def voxel_rays(
             "expected cameras of leading shape (N,) or (B, N) and a grid center of shape (3,) or (B, 3), "
             f"got {tuple(lead)} and {tuple(grid.center.shape)}"
         )
-    precise = Cameras(cameras.intrinsics.double(), cameras.world_from_camera.double(), cameras.image_size)
+    precise = cameras.to(torch.float64)
     _, direction = precise.cell_rays(feature_size, rays_per_cell)
     grid = VoxelGrid(grid.resolution, grid.extent, grid.center.double().to(direction.device))
     direction = (direction / grid.voxel_size).flatten(-4, -2)
     direction = direction.masked_fill_(direction.abs() < _PARALLEL, 0.0)
+    in_picture = precise.cells_in_picture(feature_size, rays_per_cell)
+    if in_picture is not None:
+        direction = direction.masked_fill_(~in_picture.flatten(-3)[..., None], _NO_RAY)
     origin = grid.voxel_from_world(precise.position)
     return torch.where((origin - origin.round()).abs() < NUDGE, origin.round(), origin), direction
 

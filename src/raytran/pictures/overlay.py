@@ -69,7 +69,7 @@ def overlays(
     num_frames, cameras = views.images.shape[1], Cameras.of(views.scene())
     for n in dict.fromkeys(choose_even(num_frames, min(count, num_frames)).tolist()):
         frame = frame_image(views, n)
-        camera = Cameras(cameras.intrinsics[n], cameras.world_from_camera[n], cameras.image_size)
+        camera = cameras[n]
         if frame.height < min_height:
             size = (min_height, round(frame.width * min_height / frame.height))
             frame, camera = frame.resize(size[::-1], Image.Resampling.BICUBIC), camera.scaled_to(size)
@@ -121,7 +121,7 @@ def _fill_meshes(
     shown = [(i, mesh) for i, mesh in enumerate(meshes) if mesh is not None and len(mesh.faces)]
     if not shown:
         return image
-    one = Cameras(camera.intrinsics[None], camera.world_from_camera[None], camera.image_size)
+    one = camera[None]
     ids, depth = (result[0] for result in rasterize_ids([(m.vertices, m.faces) for _, m in shown], one))
     colors = torch.tensor(CLASS_COLORS)[objects.label[[i for i, _ in shown]].cpu()]
     covered = ids >= 0

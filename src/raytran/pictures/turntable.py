@@ -111,7 +111,7 @@ def turntable_frames(
     upright = Cameras(orbit.intrinsics[0], torch.eye(4).double(), SIZE)
     rays = upright.cell_rays(SIZE)[1][..., 0, :].float()
     for n in range(num_frames):
-        camera = Cameras(orbit.intrinsics[n], orbit.world_from_camera[n], orbit.image_size)
+        camera = orbit[n]
         picture = Image.fromarray(_solid(ids[n], depths[n], rays, colors))
         large = picture.resize((SIZE[1] * _FINER, SIZE[0] * _FINER), Image.Resampling.BICUBIC)
         _draw_lines(large, lines, camera, depths[n])

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from raytran.data.files import UNFINISHED, SettingsRecord, sweep, write_text
+from raytran.data.locks import lock_when_free
 from raytran.data.scan2cad import parse_entry
 from raytran.data.text import read_json_object
 from raytran.data.workers import work_on
@@ -38,6 +39,7 @@ FORMAT = "raytran.rooms/1"
 """Rises when the same seed no longer gives the same rooms."""
 
 _CADS = "cads.json"
+_LOCK = ".rooms.lock"
 
 _NOTICES = ("credits.csv", "LICENCES.txt")
 """Files beside CAD models that must go where the models go."""
@@ -118,7 +120,7 @@ def generate_rooms(
 
     Each scene follows from ``seed``, its number and the models in ``cads`` alone. A scan whose folder carries
     its final name is done; calling again makes what is missing. An interrupt lets rooms in work end and
-    leaves nothing half-written.
+    leaves nothing half-written. Of two calls at once with one folder the second waits for the first.
 
     Args:
         output: folder that gets ``scannet/``, ``shapenet/``, ``scan2cad/`` and ``rooms.json``.
@@ -177,17 +179,22 @@ def make_splits(
     """
     started = time.monotonic()
     output, cads = Path(output).resolve(), None if cads is None else Path(cads).resolve()
-    _claim(output, claim if cads is None else claim | {"cads": digest_of(list_models(cads))})
-    left_out = {} if cads is None else _survey_cads(output, cads, processes, progress)
-    scans = output / "scannet" / "scans"
-    scans.mkdir(parents=True, exist_ok=True)
-    sweep(scans, f"{UNFINISHED}*")
-    rooms = [(split, number) for split in splits for number in split.numbers]
-    missing = [(split, number) for split, number in rooms if not (scans / scan_name(number)).is_dir()]
-    make = partial(_make_scan, output, settings, cads)
-    for _ in work_on(missing, make, label="rooms", processes=processes, progress=progress):
-        pass
-    objects = _write_lists(output, splits)
+    claim = claim if cads is None else claim | {"cads": digest_of(list_models(cads))}
+    if _record(output).path.exists():
+        _claim(output, claim)  # other settings are told before a wait, not after it
+    with lock_when_free(output / _LOCK, work=f"makes the rooms in {output}"):
+        _claim(output, claim)
+        left_out = {} if cads is None else _survey_cads(output, cads, processes, progress)
+        scans = output / "scannet" / "scans"
+        scans.mkdir(parents=True, exist_ok=True)
+        sweep(scans, f"{UNFINISHED}*")
+        rooms = [(split, number) for split in splits for number in split.numbers]
+        missing = [(split, number) for split, number in rooms if not (scans / scan_name(number)).is_dir()]
+        make = partial(_make_scan, output, settings, cads)
+        for _ in work_on(missing, make, label="rooms", processes=processes, progress=progress):
+            pass
+        objects = _write_lists(output, splits)
+        sweep(scans, f"{UNFINISHED}*")
     named = {split.name: split.scan_ids for split in splits}
     return RoomsReport(
         root=output,
@@ -250,13 +257,17 @@ def _claim(output: Path, asked: dict[str, Any]) -> None:
     Raises:
         DataError: there is one with other settings.
     """
-    record = SettingsRecord(output / "rooms.json")
+    record = _record(output)
     different = record.begin(asked)
     if different:
         raise DataError(
             f"{record.path} describes rooms made with other settings ({', '.join(different)}); "
             "choose another output folder or remove this one"
         )
+
+
+def _record(output: Path) -> SettingsRecord:
+    return SettingsRecord(output / "rooms.json")
 
 
 def _entry(path: Path) -> dict[str, Any]:

@@ -15,7 +15,6 @@ from raytran.data.prepare.report import class_table
 from raytran.data.scan2cad import SceneAnnotation, read_annotations, scene_objects
 from raytran.data.scannet.scan import read_scan
 from raytran.data.targets import cad_meshes
-from raytran.geometry.camera import Cameras
 from raytran.pictures.overlay import draw_objects
 from raytran.pictures.panels import contact_sheet
 from raytran.rooms.statistics import listed_scans, look, rooms_statistics, scan_cameras
@@ -80,7 +79,7 @@ def _pictures(root: Path, annotation: SceneAnnotation) -> tuple[Image.Image, Ima
     best = int(look(objects, cameras, shapenet_root=shapenet).shown.sum(dim=0).argmax())
     with read_scan(root / "scannet" / "scans" / annotation.scene_id) as scan:
         frame = Image.fromarray(scan.read_color(best))
-    camera = Cameras(cameras.intrinsics[best], cameras.world_from_camera[best], cameras.image_size)
+    camera = cameras[best]
     meshes = [trimesh.Trimesh(*mesh, process=False) for mesh in cad_meshes(objects, shapenet_root=shapenet)]
     return frame, draw_objects(frame, camera, objects, meshes)
 

@@ -101,9 +101,7 @@ def scan_cameras(root: Path, scan_id: str) -> Cameras:
     Raises:
         DataError: the scan is missing or damaged.
     """
-    scan = read_scan(root / "scannet" / "scans" / scan_id)
-    poses = scan.world_from_camera.float()
-    return Cameras(scan.intrinsics.float().expand(len(poses), 3, 3), poses, scan.image_size)
+    return read_scan(root / "scannet" / "scans" / scan_id).cameras.to(torch.float32)
 
 
 def _describe(root: Path, scans: Sequence[str], annotations: dict[str, SceneAnnotation]) -> dict[str, Any]:

@@ -3,25 +3,37 @@
 
 from __future__ import annotations
 
+import errno
 import functools
+import io
 import os
 import re
+import shlex
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 import hydra
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import ConfigCompositionException, InstantiationException, OverrideParseException
+from hydra.errors import (
+    ConfigCompositionException,
+    InstantiationException,
+    MissingConfigException,
+    OverrideParseException,
+)
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from raytran.checkpoints.runs import STAGE_NAMES, first_ranks, run_folder
-from raytran.errors import ConfigError, RaytranError
+from raytran.data.files import disk_full
+from raytran.data.workers import ENDS_WITH, end_with_parent
+from raytran.errors import ConfigError, DataError, RaytranError
 from raytran.run.config_dir import config_dir
+from raytran.run.path_settings import check_run_folder, literal_paths, quoted
 from raytran.run.sweep.folder import register_sweep_resolver
 from raytran.setting_limits import check_settings
 
@@ -49,10 +61,39 @@ _RENAMED = (
 )
 """Settings of earlier versions as they were typed, and as they are typed now."""
 
+_KEY = re.compile(r"[+~]{0,2}[A-Za-z_][\w./@:-]*")
+
+_SEVERAL_VALUES = re.compile(r"Ambiguous value for argument '(.*)'$", re.DOTALL)
+"""How Hydra begins to say that a comma makes a sweep of a single run."""
+
+_REFUSALS = {
+    *(errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP, errno.EACCES, errno.EPERM),
+    *(errno.EIO, errno.ESTALE, errno.EINVAL, errno.EILSEQ),
+}
+"""Numbers of errors by which a system says that a path will not do."""
+
+_UNKNOWN = re.compile(r"Could not override '(.*)'$")
+"""How Hydra begins to say that there is no such setting."""
+
+_MOST_SUGGESTIONS = 3
+
+_KEEP_A_LOG = ("train", "curriculum")
+"""Commands for which Hydra writes files of its own into the folder of the run."""
+_INTERRUPTED = 130
+"""Exit code by which a shell knows that Ctrl-C ended a command."""
+
 _WITH_VALUE = {
     *("--cfg", "-c", "--config-dir", "-cd", "--config-path", "-cp", "--config-name", "-cn", "--info", "-i"),
 }
 """Hydra's options that a word of their own may follow."""
+
+_WITH_OPTIONAL_VALUE = ("--info", "-i")
+_STARTER_ENDED = (
+    "the process that started this one has ended: it said why, or it was killed; give the same command "
+    "again, with resume=auto to go on with a run"
+)
+_NUMBERS = re.compile(r"(up|intrinsics)=\s*([-+.\deE]+(?:\s*,\s*[-+.\deE]+)+)\s*")
+"""Settings whose value may be several numbers, as typed."""
 
 _TYPED_FULL_ERROR = os.environ.get(_FULL_ERROR)
 
@@ -81,22 +122,31 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             main = hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=config_name)
         except ConfigError as error:
             _exit_with(error)
-        return functools.partial(_compose_or_exit, main(task), typed)
+        return functools.partial(_compose_or_exit, config_name, main(task), typed)
 
     return decorate
 
 
-def _compose_or_exit(command: Callable[[], Any], typed: str | None) -> Any:
+def _compose_or_exit(name: str, command: Callable[[], Any], typed: str | None) -> Any:
     """Run a command; a setting that does not exist becomes a sentence instead of Hydra's paragraph."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # a file's name need not be text
+    _end_with_starter()
     _set_full_error("1")  # Hydra then raises instead of printing; the task restores what the user has set
+    sys.argv[1:] = with_number_lists(sys.argv[1:])
     try:
+        if name in _KEEP_A_LOG:
+            check_run_folder(sys.argv[1:])
+        # Lightning starts further ranks with the words that it finds there.
+        sys.argv[1:] = literal_paths(name, _options_first(sys.argv[1:]))
         return command()
     except ConfigCompositionException as error:
         _set_full_error(typed)
-        _exit_with(_no_such_setting(error, sys.argv[1:]))
+        _exit_with(_no_such_setting(name, error, sys.argv[1:]))
     except OverrideParseException as error:
         _set_full_error(typed)
-        _exit_with(ConfigError(f"{_first_line(error)}: settings are written key=value"))
+        _exit_with(_unreadable_setting(error))
     except RaytranError as error:  # of a sweep; those of a single run do not come so far
         _set_full_error(typed)
         _exit_with(error)
@@ -106,19 +156,98 @@ def _compose_or_exit(command: Callable[[], Any], typed: str | None) -> Any:
             raise
         extras = "'raytran[sweep]' brings Optuna's sweeper, 'raytran[cluster]' the launcher for SLURM"
         _exit_with(ConfigError(f"{_first_line(error)}: it is not installed; pip install {extras}"))
+    except OSError as error:
+        _set_full_error(typed)
+        _exit_if_refused(error)
+        raise
     except OmegaConfBaseException as error:
         _set_full_error(typed)
+        _exit_if_refused(error)
         # A resolver of ours that objects is wrapped by OmegaConf; its message is the clearer one.
         _exit_with(ConfigError(_first_line(error).split("resolving interpolation: ")[-1]))
 
 
-def _no_such_setting(error: ConfigCompositionException, typed: Sequence[str]) -> ConfigError:
+def _end_with_starter() -> None:
+    """End with the process that has started this command as a part of itself, if one has."""
+    starter = os.environ.pop(ENDS_WITH, None)
+    if starter is not None and starter.isdecimal():
+        end_with_parent(_STARTER_ENDED, parent=int(starter))
+    elif "TORCHELASTIC_RUN_ID" in os.environ:
+        end_with_parent(_STARTER_ENDED)
+
+
+def _options_first(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line with Hydra's options in front: it takes none between settings."""
+    options: list[str] = []
+    settings: list[str] = []
+    before = ""
+    for word in words:
+        is_value = before in _WITH_VALUE and (before not in _WITH_OPTIONAL_VALUE or "=" not in word)
+        (options if word.startswith("-") or is_value else settings).append(word)
+        before = word
+    return [*options, *settings]
+
+
+def _no_such_setting(name: str, error: ConfigCompositionException, typed: Sequence[str]) -> ConfigError:
     """Return what to say of settings that Hydra does not know; of those it knew once, what they are now."""
     for word in typed:
         for pattern, now in _RENAMED:
             if re.match(pattern, word):
                 return ConfigError(f"{word} is called {re.sub(pattern, now, word)} now: give that instead")
+    if several := _SEVERAL_VALUES.match(_first_line(error)):
+        return ConfigError(
+            f"{several[1]} gives several values: if it is one, put it in quotes inside of the shell's, as in "
+            f"{_in_quotes(several[1])}, or add -m to run a sweep"
+        )
+    if unknown := _UNKNOWN.match(_first_line(error)):
+        meant = _similar_settings(name, unknown[1])
+        remedy = f"is {' or '.join(meant)} meant?" if meant else "--cfg job lists all"
+        return ConfigError(f"there is no setting {unknown[1]}: {remedy}")
+    if isinstance(error, MissingConfigException) and error.options:
+        return ConfigError(f"{_first_line(error)}: choose one of {', '.join(error.options)}")
     return ConfigError(f"{_first_line(error)}: there is no such setting or choice (--help lists them)")
+
+
+def _similar_settings(name: str, typed: str) -> list[str]:
+    """Return the settings of a command that somebody may mean who types one that it does not have."""
+    try:
+        content: Any = OmegaConf.to_container(compose(name, []))
+    except ConfigError:
+        return []
+    known = list(_dotted(content))
+    last = typed.rpartition(".")[2]
+    same = [setting for setting in known if setting.rpartition(".")[2] == last]
+    return same if 0 < len(same) <= _MOST_SUGGESTIONS else get_close_matches(typed, known, n=1, cutoff=0.8)
+
+
+def _dotted(content: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    for key, value in content.items():
+        yield f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            yield from _dotted(value, f"{prefix}{key}.")
+
+
+def _unreadable_setting(error: OverrideParseException) -> ConfigError:
+    """Return what to say of a word that is no setting in Hydra's grammar."""
+    key, is_setting, _ = str(error.override).partition("=")
+    if not is_setting:
+        return ConfigError(
+            f"{key} is no setting and no option: settings are written key=value (--help lists them)"
+        )
+    if _KEY.fullmatch(key) is None:
+        return ConfigError(
+            f"{key} in {error.override} is no name of a setting: settings are written key=value"
+        )
+    return ConfigError(
+        f"the value of {error.override} is not one that Hydra reads: put it in quotes inside of the shell's, "
+        f"as in {_in_quotes(str(error.override))}"
+    )
+
+
+def _in_quotes(setting: str) -> str:
+    """Return a setting as one types it for its value to be text, whatever characters it has."""
+    key, _, value = setting.partition("=")
+    return shlex.quote(f"{key}={quoted(value)}")
 
 
 def _first_line(error: Exception) -> str:
@@ -163,6 +292,18 @@ def run_or_exit(function: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
         raise
     except OmegaConfBaseException as error:
         _exit_with(ConfigError(f"{str(error).splitlines()[0]} (see --cfg job for all settings)"))
+    except KeyboardInterrupt as stop:
+        sys.stderr.write("raytran: interrupted\n")
+        raise SystemExit(_INTERRUPTED) from stop
+    except Exception as error:
+        _exit_if_refused(error)
+        full = disk_full(error)
+        if full is None:
+            raise
+        place = f"write {full.filename}" if full.filename else "go on writing"
+        _exit_with(
+            DataError(f"cannot {place} ({full.strerror}): make room there, then give the command again")
+        )
 
 
 def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
@@ -170,8 +311,8 @@ def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
 
     Args:
         config_name: root file in ``conf/`` without ending.
-        overrides: what a user would type, e.g. ``["preset=tiny", "experiment=stage2"]``. ``output_dir``
-            must be among them if the result is to be run.
+        overrides: what a user would type, e.g. ``["preset=tiny", "experiment=stage2"]``, paths as they are.
+            ``output_dir`` must be among them if the result is to be run.
 
     Raises:
         ConfigError: there is no such setting or choice.
@@ -182,15 +323,30 @@ def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
     folder = nullcontext() if already else hydra.initialize_config_dir(str(config_dir()), version_base="1.3")
     with folder:
         try:
-            return hydra.compose(config_name, overrides=list(overrides))
+            return hydra.compose(config_name, overrides=literal_paths(config_name, overrides))
         except ConfigCompositionException as error:
-            raise _no_such_setting(error, overrides) from error
+            raise _no_such_setting(config_name, error, overrides) from error
+        except OverrideParseException as error:
+            raise _unreadable_setting(error) from error
 
 
-def quoted(path: Path) -> str:
-    """Return a path as Hydra's override grammar wants it."""
-    escaped = str(path).replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'
+def typed_settings(hydra_config: Any) -> list[str]:
+    """Return the settings of a command as they were typed, but for quotes, none of them read as a reference.
+
+    Args:
+        hydra_config: the part ``hydra`` of its config.
+    """
+    typed: Any = OmegaConf.to_container(hydra_config.overrides.task)
+    return [str(item) for item in typed]
+
+
+def with_number_lists(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line with ``up=1,2,3``, which is one value, as ``up=[1,2,3]``.
+
+    To Hydra commas are those of a sweep.
+    """
+    typed = ((word, _NUMBERS.fullmatch(word)) for word in words)
+    return [word if match is None else f"{match[1]}=[{match[2]}]" for word, match in typed]
 
 
 def name_positional(words: Sequence[str], key: str) -> list[str]:
@@ -203,10 +359,32 @@ def name_positional(words: Sequence[str], key: str) -> list[str]:
     named: list[str] = []
     before = ""
     for word in words:
-        is_path = "=" not in word and not word.startswith("-") and before not in _WITH_VALUE
-        named.append(f"{key}={quoted(Path(word))}" if is_path else word)
+        is_other = word.startswith("-") or before in _WITH_VALUE or _is_setting(word)
+        named.append(word if is_other else f"{key}={quoted(word)}")
         before = word
     return named
+
+
+def _is_setting(word: str) -> bool:
+    """Return whether a word is ``key=value``, and not the name of a folder that has an equals sign."""
+    key, equals, _ = word.partition("=")
+    return bool(equals and _KEY.fullmatch(key)) and not os.path.exists(word)
+
+
+def _exit_if_refused(error: BaseException) -> None:
+    """Leave with one sentence if the system refused a path for what it is, or for where it lies.
+
+    That a file is not there, or is already, is for those to say who look for it. OmegaConf wraps what its
+    resolvers raise.
+    """
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, OSError):
+        cause = cause.__cause__ or cause.__context__
+    if cause is not None and cause.errno in _REFUSALS and cause.filename is not None:
+        path = os.fsdecode(cause.filename) if isinstance(cause.filename, str | bytes) else cause.filename
+        refused = ConfigError(f"cannot use {path} ({cause.strerror}): choose another path, or mend this one")
+        refused.__cause__ = cause
+        _exit_with(refused)
 
 
 def _exit_with(error: RaytranError) -> None:

@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A folder of results appears under its name whole or not at all."""
+"""A folder of results appears under its name whole or not at all, and one command at a time writes it."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from raytran.data.files import finished_folder
+from raytran.data.locks import exclusive_lock
 from raytran.errors import ConfigError
+
+_LONGEST_NAME = 60
 
 
 def check_replaceable(folder: Path, *, marker: str) -> None:
@@ -24,6 +28,32 @@ def check_replaceable(folder: Path, *, marker: str) -> None:
             f"output={folder} holds something that is no earlier result (no {marker} in it): "
             "choose a folder that does not exist yet"
         )
+
+
+@contextmanager
+def one_writer(folder: Path, *, marker: str) -> Iterator[None]:
+    """Keep other commands from writing a folder of results until the block ends or this process dies.
+
+    Args:
+        folder: the final name; it need not exist.
+        marker: see ``replaced_folder``.
+
+    Raises:
+        ConfigError: another process writes it, or it holds something that is no earlier result.
+        DataError: the folder above cannot be written.
+    """
+    folder = folder.resolve()
+    check_replaceable(folder, marker=marker)
+
+    def taken(who: str) -> ConfigError:
+        return ConfigError(f"another process writes {folder} ({who}): wait for it, or give another output=")
+
+    # Beside the folder, which is replaced.
+    name = folder.name
+    if len(name) > _LONGEST_NAME:
+        name = hashlib.sha256(name.encode(errors="surrogateescape")).hexdigest()
+    with exclusive_lock(folder.with_name(f".{name}.lock"), if_taken=taken):
+        yield
 
 
 @contextmanager

@@ -5,18 +5,22 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 import shutil
 from collections.abc import Callable, Collection
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
 import torch
+from lightning.fabric.utilities.seed import pl_worker_init_function
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from raytran.data.augment import Augmentation
 from raytran.data.collate import collate_scenes
+from raytran.data.workers import become_worker
 from raytran.setting_limits import check_settings
 from raytran.structs import SceneBatch, TensorStruct
 from raytran.training.scene_stream import SceneStream
@@ -150,6 +154,7 @@ class SceneDataModule(pl.LightningDataModule):
             prefetch_factor=_PREFETCHED if self._num_workers else None,
             persistent_workers=self._num_workers > 0,
             collate_fn=collate_scenes,
+            worker_init_fn=partial(_become_worker, rank=self._ranks()["rank"]),
             pin_memory=self.trainer is not None and self.trainer.strategy.root_device.type == "cuda",
             # A loader draws a seed for its workers whenever it is asked anew. From a source of its own, so
             # that a resumed run, whose loaders are new, draws the same numbers elsewhere.
@@ -178,6 +183,13 @@ class SceneDataModule(pl.LightningDataModule):
         if self.trainer is None:
             return {"num_replicas": 1, "rank": 0}
         return {"num_replicas": self.trainer.world_size, "rank": self.trainer.global_rank}
+
+
+def _become_worker(worker_id: int, *, rank: int) -> None:
+    """Begin a loader's worker process, seeded as Lightning does it where it is asked to."""
+    become_worker()
+    if int(os.environ.get("PL_SEED_WORKERS", "0")):
+        pl_worker_init_function(worker_id, rank)
 
 
 def _bytes_of(value: Any) -> int:

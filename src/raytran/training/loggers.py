@@ -8,7 +8,10 @@ import io
 import logging
 import os
 import secrets
-from collections.abc import Iterator, Mapping
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import partial
 from netrc import NetrcParseError, netrc
 from pathlib import Path
 from typing import Any
@@ -26,6 +29,10 @@ _log = logging.getLogger(__name__)
 METRICS = "metrics.csv"
 WANDB_ID = "wandb-id.txt"
 
+_OFFLINE = ("offline", "dryrun")
+"""Values of WANDB_MODE with which W&B keeps to this machine; the second is its former name."""
+
+_WITHOUT_COLUMN = ""
 _GROUP_RECORDS = ("sweep.json", "curriculum.json")
 """Files by which the folder of a sweep or of a curriculum is known."""
 
@@ -83,17 +90,13 @@ class MetricsTable(Logger):
         """Write the rows that wait; on a full disk they wait on."""
         if not self._waiting:
             return
-        known = set(self._columns)
-        new = sorted({name for row in self._waiting for name in row} - known)
+        is_known = {name for row in self._waiting for name in row} <= set(self._columns)
         try:
-            if new or not self.path.is_file():
-                rows = [*self._read(), *self._waiting]
-                self._columns += new
-                self._rewrite(rows)
+            # After a write that failed the file may end anywhere.
+            if is_known and not self._failed and self.path.is_file():
+                self._append(self._waiting)
             else:
-                with self.path.open("a", newline="", encoding="utf-8") as file:
-                    writer = csv.DictWriter(file, self._columns, lineterminator="\n")
-                    writer.writerows(self._waiting)
+                self._rewrite([*self._read(), *self._waiting])
         except OSError as error:
             if not self._failed:
                 reason = error.strerror
@@ -116,22 +119,49 @@ class MetricsTable(Logger):
         rows = [row for row in self._read() if (_step_of(row) or 0) < step]
         self._rewrite(rows)
 
+    def _append(self, rows: list[dict[str, Any]]) -> None:
+        text = io.StringIO()
+        csv.DictWriter(text, self._columns, lineterminator="\n").writerows(rows)
+        size = self.path.stat().st_size
+        try:
+            with self.path.open("a", newline="", encoding="utf-8") as file:
+                file.write(text.getvalue())
+        except OSError:
+            os.truncate(self.path, size)  # the disk was full in the middle of a row
+            raise
+
     def _read(self) -> list[dict[str, Any]]:
-        """Return the rows of the file, but for a last line that a kill cut short; take over its columns."""
-        if not self.path.is_file():
-            return []
-        lines = self.path.read_text(encoding="utf-8", errors="replace").splitlines(keepends=True)
-        table = csv.DictReader(line for line in lines if line.endswith("\n"))
-        rows = list(_rows(table))
-        self._columns = list(table.fieldnames or self._columns)
-        return [row for row in rows if None not in row and _step_of(row) is not None]
+        """Return the rows of the file and take over its columns."""
+        columns, rows = _read_table(self.path)
+        self._columns = columns or self._columns
+        return rows
 
     def _rewrite(self, rows: list[dict[str, Any]]) -> None:
+        """Write the file anew; its columns count as known only once they are in it."""
+        new = {name for row in rows for name in row} - set(self._columns)
+        columns = [*self._columns, *sorted(new)]
         text = io.StringIO()
-        writer = csv.DictWriter(text, self._columns, lineterminator="\n")
+        writer = csv.DictWriter(text, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
         write_text(self.path, text.getvalue())
+        self._columns = columns
+
+
+def _read_table(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
+    """Return the columns and rows of a run's table, as far as they are whole; nothing if there is none.
+
+    Left out are a last line that a kill cut short, a row without a step, and values without a column, which
+    earlier versions wrote on a disk that had been full.
+    """
+    if not path.is_file():
+        return [], []
+    text = path.read_text(encoding="utf-8", errors="replace")
+    lines = [line for line in text.splitlines(keepends=True) if line.endswith("\n") and "\0" not in line]
+    table = csv.DictReader(lines, restkey=_WITHOUT_COLUMN)
+    columns = list(table.fieldnames or ())
+    rows = [{name: row[name] for name in columns} for row in _rows(table)]
+    return columns, [row for row in rows if _step_of(row) is not None]
 
 
 def _rows(table: csv.DictReader[str]) -> Iterator[dict[str, Any]]:
@@ -162,22 +192,53 @@ def read_history(folder: Path) -> dict[str, list[tuple[int, float]]]:
     Args:
         folder: of the run.
     """
-    path = folder / METRICS
-    if not path.is_file():
-        return {}
     history: dict[str, dict[int, float]] = {}
-    with path.open(newline="", encoding="utf-8", errors="replace") as file:
-        for row in _rows(csv.DictReader(file)):
-            step = _step_of(row)
-            for name, value in row.items():
-                number = _number(value)
-                if name not in (None, "step", "epoch") and number is not None and step is not None:
-                    history.setdefault(name, {})[step] = number
+    for row in _read_table(folder / METRICS)[1]:
+        for name, value in row.items():
+            number = _number(value)
+            if name not in ("step", "epoch") and number is not None:
+                history.setdefault(name, {})[int(row["step"])] = number
     return {name: sorted(values.items()) for name, values in history.items()}
 
 
 class ContinuedTensorBoard(TensorBoardLogger):
-    """Writes further event files into the folder of a run; what is logged twice after a resume shows once."""
+    """Writes further event files into the folder of a run; what is logged twice after a resume shows once.
+
+    Where the files cannot be written, on a full disk for instance, that is said once and the run goes on.
+    """
+
+    _is_failure_told = False
+
+    @rank_zero_only
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Log values."""
+        with self._told_once():
+            super().log_metrics(metrics, step)
+
+    @rank_zero_only
+    def save(self) -> None:
+        """Write what waits."""
+        with self._told_once():
+            super().save()
+
+    @rank_zero_only
+    def finalize(self, status: str) -> None:
+        """Write what waits and close the file."""
+        with self._told_once():
+            super().finalize(status)
+
+    @contextmanager
+    def _told_once(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, ValueError) as error:
+            failure = error if isinstance(error, OSError) else error.__cause__  # Lightning wraps it
+            if not isinstance(failure, OSError):
+                raise
+            if not self._is_failure_told:
+                said = "no more events for TensorBoard in %s (%s): make room there; training goes on"
+                _log.warning(said, self.log_dir, failure.strerror)
+            self._is_failure_told = True
 
     @rank_zero_only
     def continue_from(self, step: int) -> None:
@@ -198,36 +259,54 @@ def tensorboard_logger(*, save_dir: str) -> Any:
         ConfigError: the package is not installed.
     """
     try:
-        return ContinuedTensorBoard(save_dir=save_dir, name="tensorboard", version="")
+        logger = ContinuedTensorBoard(save_dir=save_dir, name="tensorboard", version="")
     except ModuleNotFoundError as error:
         raise ConfigError(
             "TensorBoard is not installed: pip install 'raytran[tensorboard]', or choose another logger="
         ) from error
+    threading.excepthook = partial(_leave_out_event_writers, before=threading.excepthook)
+    return logger
+
+
+def _leave_out_event_writers(
+    failure: threading.ExceptHookArgs, *, before: Callable[[threading.ExceptHookArgs], Any]
+) -> None:
+    """Show why a thread ended, unless it writes events and could not: the logger says that."""
+    is_writer = type(failure.thread).__name__ == "_AsyncWriterThread"
+    if not (is_writer and isinstance(failure.exc_value, OSError)):
+        before(failure)
 
 
 def wandb_logger(*, project: str, name: str, save_dir: str) -> Any:
     """Return a logger to Weights & Biases, offline where the machine has no key; WANDB_MODE overrides.
 
-    A resumed run goes on as the same run there: its id is kept in ``wandb-id.txt`` in the run's folder. The
-    runs of a sweep or a curriculum form a group.
+    A resumed run goes on as the same run there: its id is kept in ``wandb-id.txt`` in the run's folder. But
+    what was logged offline cannot be continued: ``wandb sync`` of a part may replace what was sent of another
+    with the same id (wandb issues 3841, 5865). So each offline part, and what follows one, is a run of its
+    own, ``NAME part 2``, in one group with the others. The runs of a sweep or a curriculum form a group too.
     """
     # Imported here: it takes a second, and most runs do without.
     from lightning.pytorch.loggers import WandbLogger
 
     folder = Path(save_dir)
-    offline = "WANDB_MODE" not in os.environ and not _has_wandb_key()
-    if offline:
+    mode = os.environ.get("WANDB_MODE")
+    offline = mode in _OFFLINE or (mode is None and not _has_wandb_key())
+    if mode is None and offline:
         _log.info("no W&B key found: logging offline in %s (send it later with `wandb sync`)", folder)
     folder.mkdir(parents=True, exist_ok=True)
     group, job = group_and_job(folder)
+    ids = _ids_of_parts(folder, offline=offline)
+    if group is None and (offline or len(ids) > 1):
+        group = f"{folder.absolute().parent.name} {folder.absolute().name}"
+    part = f"part {len(ids)}" if len(ids) > 1 else ""
     return WandbLogger(
         project=project,
-        name=f"{name} {job}".strip(),
+        name=" ".join(word for word in (name, job, part) if word),
         group=group,
         save_dir=save_dir,
         offline=offline,
-        id=_kept_id(folder / WANDB_ID),
-        resume=None if offline else "allow",  # offline, `wandb sync` puts parts of one id together
+        id=ids[-1],
+        resume=None if offline else "allow",
     )
 
 
@@ -246,12 +325,19 @@ def group_and_job(folder: Path) -> tuple[str | None, str]:
     return f"{outermost.parent.name} {outermost.name}", folder.relative_to(outermost).as_posix()
 
 
-def _kept_id(path: Path) -> str:
-    """Return the id in a file; a new one, written there, where there is none."""
-    if not path.is_file():
-        # Only the first rank talks to W&B, so it does not matter whose id is kept if several begin at once.
-        write_text(path, secrets.token_hex(4) + "\n")
-    return path.read_text(encoding="utf-8").strip()
+def _ids_of_parts(folder: Path, *, offline: bool) -> list[str]:
+    """Return the ids of a run's parts, the last of them that to log with, and write down a new one.
+
+    An id is used again for a run that was online and is so now, and if nothing was logged with it yet.
+    """
+    path = folder / WANDB_ID
+    ids = path.read_text(encoding="utf-8").split() if path.is_file() else []
+    if ids and getattr(rank_zero_only, "rank", 0) != 0:
+        return ids  # only the first rank talks to W&B
+    if not ids or any(folder.glob(f"wandb/{'*' if offline else 'offline-'}run-*-{ids[-1]}")):
+        ids.append(secrets.token_hex(4))
+        write_text(path, "".join(f"{known}\n" for known in ids))
+    return ids
 
 
 def _has_wandb_key() -> bool:

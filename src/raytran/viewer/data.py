@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from raytran.data.images import decode_image
 from raytran.data.scannet.text import are_rigid
 from raytran.data.text import as_name, parse_json
 from raytran.errors import DataError, RaytranError
@@ -32,7 +33,6 @@ from raytran.limits import (
     BOX_SIDE,
     FOCAL_LENGTH,
     MATRIX_ENTRY,
-    MAX_SIDE,
     PIXEL,
     POSITION,
     SCORE,
@@ -134,8 +134,7 @@ class ViewerScene:
 
     def camera(self, frame: int) -> Cameras:
         """Return the camera of one frame, no leading dimensions."""
-        cameras = self.cameras
-        return Cameras(cameras.intrinsics[frame], cameras.world_from_camera[frame], cameras.image_size)
+        return self.cameras[frame]
 
     @property
     def occupancy(self) -> Tensor | None:
@@ -198,10 +197,8 @@ def _read_volumes(
     features = observed.runs([len(frames) * size[0] * size[1] for _, frames in runs])
     volumes = []
     for (center, frames), (query, key) in zip(runs, features, strict=True):
-        index = list(frames)
-        pose = views.world_from_camera[0, index].cpu()
-        cameras = Cameras(views.intrinsics[0, index].cpu(), pose, views.image_size)
-        grid = VoxelGrid(model.grid_resolution, model.grid_extent, center.to(pose))
+        cameras = Cameras.of(views.scene())[list(frames)].to("cpu")
+        grid = VoxelGrid(model.grid_resolution, model.grid_extent, center.to(cameras.position))
         pairs = trace_pairs(cameras, grid, size, model.rays_per_cell)
         reads = pack_reads(attention_weights(query, key, pairs), pairs, size)
         volumes.append(VoxelVolume(grid, frames, reads=reads))
@@ -240,6 +237,8 @@ def write_viewer_data(
         "intrinsics": views.intrinsics[0].double().cpu().numpy(),
         "world_from_camera": views.world_from_camera[0].double().cpu().numpy(),
     }
+    if views.picture is not None:
+        arrays["picture"] = views.picture[0].double().cpu().numpy()
     for n in range(len(frame_ids)):
         arrays[f"frame{n}"] = _jpeg(frame_image(views, n))
     for n, volume in enumerate(volumes):
@@ -331,7 +330,10 @@ def _cameras(arrays: Mapping[str, NDArray[Any]], image_size: Any, count: int) ->
     poses = as_numbers(arrays["world_from_camera"], (count, 4, 4), MATRIX_ENTRY, "world_from_camera")
     if (intrinsics[:, [0, 1], [0, 1]] < FOCAL_LENGTH.low).any() or not are_rigid(poses).all():
         raise ValueError("a camera is none that can be")
-    return Cameras(torch.from_numpy(intrinsics), torch.from_numpy(poses), (height, width))
+    picture = None
+    if "picture" in arrays:
+        picture = torch.from_numpy(as_numbers(arrays["picture"], (count, 4), PIXEL, "picture"))
+    return Cameras(torch.from_numpy(intrinsics), torch.from_numpy(poses), (height, width), picture)
 
 
 def _read_mesh(path: Path) -> trimesh.Trimesh | None:
@@ -339,7 +341,7 @@ def _read_mesh(path: Path) -> trimesh.Trimesh | None:
         return None
     try:
         with np.errstate(all="ignore"):  # what numbers there are is looked at below
-            mesh = trimesh.load_mesh(path, process=False)
+            mesh = trimesh.load_mesh(path, process=False, skip_materials=True)
     except Exception as error:  # trimesh raises whatever its parser stumbles over
         raise DataError(f"cannot read the mesh {path} ({str(error)[:80]!r}): predict again") from error
     if not isinstance(mesh, trimesh.Trimesh) or not (np.abs(mesh.vertices) <= POSITION.high).all():
@@ -348,11 +350,7 @@ def _read_mesh(path: Path) -> trimesh.Trimesh | None:
 
 
 def _image(content: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    # No other decoder than that of what is written.
-    with Image.open(io.BytesIO(content.tobytes()), formats=["JPEG"]) as image:
-        if max(image.size) > MAX_SIDE:
-            raise ValueError(f"a frame has {image.width} x {image.height} pixels")
-        return np.asarray(image.convert("RGB"))
+    return decode_image(content.tobytes(), name=f"of a frame in {FILE}").permute(1, 2, 0).numpy()
 
 
 def _truth(arrays: Mapping[str, NDArray[Any]]) -> ObjectSet:

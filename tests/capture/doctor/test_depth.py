@@ -34,7 +34,7 @@ def test_depth_maps_give_rays_that_end_where_they_say(copy):
     assert raw.read_depth(1) is None
     surface = points_from_depth_maps(raw, raw.intrinsics)
     assert set(surface.frame.tolist()) == {0, 4}
-    pixel = surface.ray @ raw.intrinsics.T
+    pixel = surface.ray @ raw.intrinsics[0].T
     height, width = raw.scan.image_size
     # The map is half as large as the image; a column's middle lies half a cell behind its start.
     expected = np.interp(pixel[:, 0] / width * 120 - 0.5, np.arange(120), depth[-1])
@@ -69,4 +69,4 @@ def test_a_scan_without_depth_says_so(raw, matches):
     assert depth_of_matches(raw, matches) is None
     surface = points_from_matches(matches, np.full(len(matches), 2.0), raw.intrinsics)
     assert len(surface) == len(matches)
-    np.testing.assert_allclose((surface.ray @ raw.intrinsics.T)[:, :2], matches.pixel[:, 0])
+    np.testing.assert_allclose((surface.ray @ raw.intrinsics[0].T)[:, :2], matches.pixel[:, 0])

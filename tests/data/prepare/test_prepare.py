@@ -44,7 +44,7 @@ def test_frames_cameras_models_and_lists(released, prepare, tmp_path):
     assert after.frame_id == ("0", "20", "100")
     assert torch.equal(after.world_from_camera, before.world_from_camera[[0, 2, 3]])
     assert after.image_size == (16, 24)
-    expected = before.intrinsics * torch.tensor([[0.5], [0.5], [1.0]])
+    expected = before.intrinsics[[0, 2, 3]] * torch.tensor([[0.5], [0.5], [1.0]])
     assert torch.equal(after.intrinsics, expected)
     assert torch.equal(after.axis_alignment, before.axis_alignment)
     with Image.open(out / SCAN / "color" / "100.jpg") as image:
@@ -81,7 +81,7 @@ def test_recordings_are_read_and_one_that_ends_early_is_named(released, prepare,
     path.write_bytes(path.read_bytes()[:-2500])
     report = prepare(released, tmp_path / "out", settings=PrepareSettings((32, 48), max_frames=None)).report
     assert report["frames"]["forms"] == {"exporter": 1, "sens": 2}
-    assert report["frames"]["dropped"]["pose is not finite or no rigid motion"] == 2
+    assert report["frames"]["dropped"]["pose is not finite or out of bounds"] == 2
     (cut,) = report["noticed"]["recordings_cut_short"].items()
     assert cut[0] == "scene0001_00"
     assert "ends after 5 of the 8 frames" in cut[1]

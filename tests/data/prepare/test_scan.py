@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+from io import BytesIO
+
 import numpy as np
-import pytest
 import torch
 from PIL import Image
 
@@ -17,7 +18,6 @@ from raytran.data.prepare.scan import (
 )
 from raytran.data.scannet.scan import read_scan
 from raytran.data.scannet.text import read_matrix
-from raytran.errors import DataError
 
 
 def test_names_are_numbers_unless_two_agree():
@@ -72,8 +72,9 @@ def test_damaged_frames_are_replaced_by_the_nearest_that_is_not_chosen(write_sca
     assert sorted(path.name for path in (out / "pose").iterdir()) == ["1.txt", "5.txt", "7.txt"]
 
 
-def test_frames_of_another_size_count_as_damaged(write_scan, tmp_path):
+def test_frames_of_another_size_come_in_the_prepared_one(write_scan):
     folder = write_scan()
-    Image.new("RGB", (24, 16)).save(folder / "color" / "10.jpg")
-    with pytest.raises(DataError, match="24x16"):
-        encoded_frame(read_scan(folder), 1, (32, 48))
+    Image.new("RGB", (24, 16), (90, 90, 90)).save(folder / "color" / "10.jpg")
+    content, ending = encoded_frame(read_scan(folder), 1, (32, 48))
+    with Image.open(BytesIO(content)) as image:
+        assert (image.size, image.getpixel((40, 20)), ending) == ((48, 32), (90, 90, 90), ".jpg")

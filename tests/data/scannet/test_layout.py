@@ -47,7 +47,7 @@ def test_lost_poses_and_missing_files_in_every_form(scan_in_form, tmp_path, form
     poses[names[1]].unlink()
     images[names[2]].unlink()
     assert read_scan(folder).dropped == {
-        names[0]: "pose is not finite or no rigid motion",
+        names[0]: "pose is not finite or out of bounds",
         names[1]: "no pose",
         names[2]: "no image",
     }
@@ -79,13 +79,13 @@ def test_intrinsics_at_any_place_as_3x3_or_4x4(scan_in_form, tmp_path, name, sid
     shutil.rmtree(folder / "intrinsic")
     (folder / name).parent.mkdir(exist_ok=True)
     np.savetxt(folder / name, matrix[:side, :side])
-    np.testing.assert_array_equal(read_scan(folder).intrinsics.numpy(), matrix[:3, :3])
+    np.testing.assert_array_equal(read_scan(folder).intrinsics[0].numpy(), matrix[:3, :3])
 
 
 def test_intrinsics_of_odam_may_lie_outside_the_frames(scan_in_form, tmp_path) -> None:
     folder = scan_in_form("odam", tmp_path / "scene0001_00")
     shutil.move(folder / "frames" / "intrinsic", folder / "intrinsic")
-    assert read_scan(folder).intrinsics[0, 0] == 40
+    assert read_scan(folder).intrinsics[0, 0, 0] == 40
 
 
 def test_info_file_without_intrinsics(scan_in_form, tmp_path) -> None:

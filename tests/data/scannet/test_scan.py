@@ -11,6 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
+from raytran.data.scan import LOST
 from raytran.data.scannet.scan import load_views, open_scan, read_scan, read_sens
 from raytran.errors import DataError
 
@@ -40,8 +41,14 @@ def test_frames_without_image_or_valid_pose_are_dropped_with_the_reason(write_sc
     (folder / "pose" / "6.txt").unlink()
     scan = read_scan(folder)
     assert scan.frame_id == ("0",)
-    rigid = "pose is not finite or no rigid motion"
-    assert scan.dropped == {"1": rigid, "2": rigid, "3": rigid, "4": rigid, "5": "no image", "6": "no pose"}
+    assert scan.dropped == {
+        "1": LOST,
+        "2": LOST,
+        "3": "no camera-to-world matrix of numbers",
+        "4": "pose is all zeros",
+        "5": "no image",
+        "6": "no pose",
+    }
 
 
 def test_header_gives_the_axis_alignment(write_scan) -> None:
@@ -86,7 +93,7 @@ def test_all_poses_invalid(write_scan) -> None:
     for path in (folder / "pose").iterdir():
         np.savetxt(path, np.full((4, 4), -np.inf))
     with pytest.raises(
-        DataError, match=r"none of the 4 frames in .*scene0000_00 has an image and a valid pose"
+        DataError, match=r"none of the 4 frames of .*scene0000_00 has an image and a valid pose"
     ):
         read_scan(folder)
 
@@ -114,7 +121,7 @@ def test_intrinsics_for_a_slightly_other_size_that_the_header_states(write_scan)
 
 def test_intrinsics_that_are_no_matrix(write_scan) -> None:
     folder = write_scan()
-    (folder / "intrinsic" / "intrinsic_color.txt").write_text("577 577 320 240")
+    (folder / "intrinsic" / "intrinsic_color.txt").write_text("577 577 320")
     with pytest.raises(DataError, match="does not hold a 4x4 or 3x3 camera matrix"):
         read_scan(folder)
 
@@ -156,8 +163,7 @@ def test_a_recording_drops_what_an_export_drops(write_sens) -> None:
     (path.parent / "scene0000_00.txt").write_text("axisAlignment = 1 0 0 5 0 1 0 0 0 0 1 0 0 0 0 1\n")
     with read_sens(path) as scan:
         assert (scan.scene_id, scan.frame_id) == ("scene0000_00", ("1", "2", "4"))
-        rigid = "pose is not finite or no rigid motion"
-        assert scan.dropped == {"0": rigid, "3": rigid}
+        assert scan.dropped == {"0": LOST, "3": LOST}
         assert scan.world_from_camera[:, 0, 3].tolist() == pytest.approx([0.01, 0.02, 0.04])
         assert scan.image_size == (32, 48)
         assert scan.axis_alignment[0, 3] == 5
@@ -180,7 +186,7 @@ def test_a_cut_recording_gives_the_frames_before_and_says_so(write_sens, caplog)
 def test_recordings_without_a_usable_frame(write_sens) -> None:
     path = write_sens(frames=3, lost=[0, 1, 2])
     with pytest.raises(
-        DataError, match=r"none of the 3 frames in .*scene0000_00\.sens has an image and a valid"
+        DataError, match=r"none of the 3 frames of .*scene0000_00\.sens has an image and a valid"
     ):
         read_sens(path)
     path = write_sens("scene0001_00", frames=0)
@@ -220,7 +226,7 @@ def test_real_scan_with_lost_frames(shared_dir) -> None:
     assert sorted(scan.dropped) == ["255", "605"]
     assert scan.frame_id == tuple(str(n) for n in range(0, 600, 10))
     assert scan.image_size == (480, 640)
-    assert scan.intrinsics[0].tolist() == [577.870605, 0.0, 319.5]
+    assert scan.intrinsics[0, 0].tolist() == [577.870605, 0.0, 319.5]
     # The scan is turned by 4.3° against its walls; poses stay as they are.
     angle = torch.atan2(scan.axis_alignment[1, 0], scan.axis_alignment[0, 0]).rad2deg()
     assert angle.item() == pytest.approx(-4.3, abs=0.05)
@@ -269,3 +275,130 @@ def test_real_walk_is_resized_to_another_aspect(shared_dir) -> None:
     with Image.open(folder / "color" / f"{frame_id[0]}.jpg") as image:
         mean = np.asarray(image, dtype=float).mean(axis=(0, 1))
     np.testing.assert_allclose(views.images[0, 0].float().mean(dim=(1, 2)), mean, atol=1.0)
+
+
+def test_images_of_another_shape_are_dropped_and_those_of_another_size_used(write_scan) -> None:
+    folder = write_scan(frames=range(9))
+    for n, size in ((0, (30, 30)), (2, (32, 48)), (4, (24, 16)), (5, (96, 64)), (7, (32, 48))):
+        Image.new("RGB", size, (n, n, n)).save(folder / "color" / f"{n}.jpg", quality=95)
+    scan = read_scan(folder)
+    assert (scan.image_size, scan.frame_id) == ((32, 48), ("1", "3", "4", "5", "6", "8"))
+    turned = "image turned by 90° against its intrinsics"
+    shape = "image of another shape than its intrinsics are for"
+    assert scan.dropped == {"0": shape, "2": turned, "7": turned}
+    assert scan.intrinsics.shape == (6, 3, 3)
+    assert scan.world_from_camera[:, 0, 3].tolist() == pytest.approx([0.01, 0.03, 0.04, 0.05, 0.06, 0.08])
+    for index, number in ((2, 4), (3, 5)):
+        assert (scan.read_color(index) == number).all()
+        assert scan.read_color(index).shape == (32, 48, 3)
+        assert scan.read_color(index, (8, 16)).shape == (8, 16, 3)
+        assert scan.color_bytes(index) is None
+    assert scan.color_bytes(0) is not None
+    views, used = load_views(folder, image_size=(16, 24), num_views=6)
+    assert used == scan.frame_id
+    assert (views.intrinsics == views.intrinsics[:, :1]).all()
+    assert views.picture is None
+
+
+def test_the_images_that_the_intrinsics_fit_are_used_though_most_are_turned(write_scan) -> None:
+    folder = write_scan(frames=range(5))
+    for n in (0, 2, 4):
+        Image.new("RGB", (32, 48)).save(folder / "color" / f"{n}.jpg")
+    scan = read_scan(folder)
+    assert (scan.image_size, scan.frame_id) == ((32, 48), ("1", "3"))
+    for n in (1, 3):
+        Image.new("RGB", (32, 48)).save(folder / "color" / f"{n}.jpg")
+    with pytest.raises(DataError, match="images turned by 90° against the stored 32x48: give the intrinsics"):
+        read_scan(folder)
+
+
+def test_an_image_whose_header_is_damaged_is_named_when_it_is_read(write_scan) -> None:
+    folder = write_scan(frames=range(4))
+    (folder / "color" / "0.jpg").write_bytes(b"no image")
+    scan = read_scan(folder)
+    assert scan.image_size == (32, 48)
+    assert load_views(folder, image_size=(32, 48), num_views=4)[1] == ("1", "1", "2", "3")
+
+
+def test_intrinsics_of_a_crop(write_scan) -> None:
+    folder = write_scan()
+    matrix = np.diag([40.0, 40, 1, 1])
+    matrix[:2, 2] = (4, 30)
+    np.savetxt(folder / "intrinsic" / "intrinsic_color.txt", matrix)
+    assert read_scan(folder).intrinsics[0, 0, 2] == 4
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda pose: "\ufeff" + "\n".join(" ".join(map(str, row)) for row in pose),
+        lambda pose: "\n".join(",".join(map(str, row)) for row in pose),
+        lambda pose: "\r\n".join("; ".join(map(str, row)) for row in pose),
+        lambda pose: "\n".join(" ".join(map(str, row)) for row in pose[:3]),
+        lambda pose: " ".join(map(str, pose.ravel())),
+        lambda pose: ", ".join(map(str, pose[:3].ravel())),
+        lambda pose: "# camera to world\n" + "\n".join("\t".join(map(str, row)) for row in pose),
+    ],
+    ids=["mark", "commas", "semicolons", "3x4", "one line", "12 in one line", "comment"],
+)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_poses_as_other_programs_write_them(write_scan, write, encoding) -> None:
+    folder = write_scan()
+    expected = read_scan(folder).world_from_camera
+    for path in (folder / "pose").iterdir():
+        text = write(np.loadtxt(path))
+        path.write_text(text.lstrip("\ufeff") if encoding == "utf-16" else text, encoding=encoding)
+    assert torch.equal(read_scan(folder).world_from_camera, expected)
+
+
+def test_a_rotation_alone_is_no_pose(write_scan) -> None:
+    folder = write_scan(frames=(0, 1, 2))
+    np.savetxt(folder / "pose" / "1.txt", np.eye(3))
+    np.savetxt(folder / "pose" / "2.txt", np.eye(4) * [1, 1, -1, 1])
+    assert read_scan(folder).dropped == {
+        "1": "no camera-to-world matrix of numbers",
+        "2": "left-handed pose (determinant −1)",
+    }
+
+
+def test_all_poses_left_handed_or_scaled(write_scan) -> None:
+    folder = write_scan()
+    poses = {path: np.loadtxt(path) for path in (folder / "pose").iterdir()}
+    for spoil, said in (
+        (np.diag([1.0, 1, -1, 1]), r"4 left-handed pose \(determinant −1\).*: one axis is mirrored"),
+        (np.diag([0.5, 0.5, 0.5, 1]), "4 rotation scaled by 0.5.*: divide the upper left 3x3"),
+    ):
+        for path, pose in poses.items():
+            np.savetxt(path, spoil @ pose)
+        with pytest.raises(DataError, match=said):
+            read_scan(folder)
+
+
+def test_the_depth_cameras_intrinsics_are_not_taken(write_scan) -> None:
+    folder = write_scan()
+    (folder / "intrinsic" / "intrinsic_color.txt").rename(folder / "intrinsic" / "intrinsic_depth.txt")
+    with pytest.raises(
+        DataError, match=r"intrinsic_depth\.txt is of the depth camera, and intrinsic_color\.txt"
+    ):
+        read_scan(folder)
+    assert read_scan(folder, intrinsics=(40, 41, 24, 16)).intrinsics.reshape(-1, 3, 3)[0, 1, 1] == 41
+
+
+def test_the_header_fills_in_intrinsics_and_does_not_replace_them(write_scan, caplog) -> None:
+    folder = write_scan()
+    path = folder / "intrinsic" / "intrinsic_color.txt"
+    header = "colorWidth = 48\ncolorHeight = 32\nfx_color = {}\nfy_color = 40\nmx_color = 24\nmy_color = 16\n"
+    (folder / "scene0000_00.txt").write_text(header.format(40.7))
+    assert read_scan(folder).intrinsics.reshape(-1, 3, 3)[0, 0, 0] == 40
+    assert "differ by 1.7 % in the intrinsics of the colour camera: the former are taken" in caplog.text
+    path.unlink()
+    assert read_scan(folder).intrinsics.reshape(-1, 3, 3)[0, 0, 0] == 40.7
+    (folder / "scene0000_00.txt").write_text(header.format("wide"))
+    with pytest.raises(DataError, match=r"intrinsic_color\.txt is missing: .*or give intrinsics=fx,fy,cx,cy"):
+        read_scan(folder)
+
+
+def test_intrinsics_as_four_numbers(write_scan) -> None:
+    folder = write_scan()
+    (folder / "intrinsic" / "intrinsic_color.txt").write_text("40, 41, 24, 16\n", encoding="utf-8-sig")
+    assert read_scan(folder).intrinsics.reshape(-1, 3, 3)[0].tolist() == [[40, 0, 24], [0, 41, 16], [0, 0, 1]]

@@ -190,6 +190,7 @@ def test_faces_have_the_colour_of_their_material_or_the_mean_of_its_texture(mode
         "newmtl red one\nmap_Kd ../images/missing.png\n",
         "newmtl red one\nmap_Kd ../../../../secret.png\n",
         "newmtl red one\nmap_Kd ../notes.txt\n",
+        "newmtl red one\nmap_Kd ../postscript.png\n",
         "newmtl red one\nmap_Kd a\0b.png\n",
         "newmtl red one\nmap_Kd ../link.png\n",
         "newmtl red one\nmap_Kd\n",
@@ -200,6 +201,7 @@ def test_what_cannot_be_read_is_grey(model, mtl):
     Image.new("RGB", (2, 2), "red").save(secret)
     (model.parents[1] / "link.png").symlink_to(secret)
     (model.parents[1] / "notes.txt").write_text("no picture")
+    Image.new("RGB", (2, 2), "red").save(model.parents[1] / "postscript.png", "EPS")
     if mtl is not None:
         model.with_suffix(".mtl").write_text(mtl)
     np.testing.assert_allclose(colors_of(model, 5), np.round(0.7 * 255) / 255)

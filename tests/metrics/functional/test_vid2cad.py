@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +12,8 @@ import pytest
 import torch
 
 from raytran.metrics import Scan2CADAccuracy
+from raytran.metrics.functional.cad_errors import cad_errors, equal_names
+from raytran.metrics.functional.vid2cad import _counts
 from raytran.structs import CadAlignments
 
 CLASS_OF = {
@@ -217,3 +220,32 @@ def test_class_accuracy_is_rounded():
         result["class_average"] == result["per_class"]["chair"]["accuracy"] == pytest.approx(0.333, abs=1e-9)
     )
     assert result["global_average"] == 1 / 3
+
+
+def test_duplicates_are_those_of_the_table_of_all_pairs():
+    """The table as a whole, as small files had it before; 400 predictions are several parts of it."""
+    count, rng = 400, np.random.default_rng(0)
+    yaw = rng.uniform(0, 6.3, count) / 2
+    quaternion = np.stack([np.cos(yaw), 0 * yaw, np.sin(yaw), 0 * yaw], axis=-1)
+    catid = tuple(rng.choice(list(CLASS_OF)[:2], count).tolist())
+    ranked = CadAlignments(
+        catid=catid,
+        id_cad=("a",) * count,
+        translation=torch.from_numpy(rng.uniform(0, 2, (count, 3))),
+        quaternion=torch.from_numpy(quaternion + rng.normal(size=(count, 4)) * 0.1),
+        scale=torch.from_numpy(rng.uniform(0.5, 1.5, (count, 3))),
+        score=torch.linspace(1, 0, count).double(),
+    )
+    symmetry = torch.from_numpy(rng.choice([0, 1, 2, 4], count))
+    unit = torch.nn.functional.normalize(ranked.quaternion.float(), dim=-1).double()
+    turned = replace(ranked, quaternion=unit)
+    turns = symmetry[:, None].expand(-1, count)
+    errors = cad_errors(turned, turned, ranked.translation, turns, torch.float32)
+    close = equal_names(catid, catid) & errors.within(0.4, 60.0, 0.6)
+    expected = torch.ones(count, dtype=torch.bool)
+    for index in range(count):
+        if expected[index]:
+            expected[index + 1 :] &= ~close[index, index + 1 :]
+    assert 50 < int(expected.sum()) < 350
+    left = Counter(dict.fromkeys(catid, count))
+    assert torch.equal(_counts(ranked, symmetry, left), expected)

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -21,8 +23,7 @@ DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 
 
 def _on_device(cameras: Cameras, grid: VoxelGrid) -> tuple[Cameras, VoxelGrid]:
-    moved = Cameras(cameras.intrinsics.to(DEVICE), cameras.world_from_camera.to(DEVICE), cameras.image_size)
-    return moved, VoxelGrid(grid.resolution, grid.extent, grid.center.to(DEVICE))
+    return cameras.to(DEVICE), VoxelGrid(grid.resolution, grid.extent, grid.center.to(DEVICE))
 
 
 def _check(cameras: Cameras, grid: VoxelGrid, feature_size: tuple[int, int], rays_per_cell: int) -> None:
@@ -41,6 +42,17 @@ def _check(cameras: Cameras, grid: VoxelGrid, feature_size: tuple[int, int], ray
 def test_equals_the_pair_list(random_cameras, spread, feature_size, rays_per_cell):
     grid = VoxelGrid((9, 5, 6), (4.1, 2.3, 2.7), torch.tensor([0.1, -0.2, 0.05], dtype=torch.float64))
     _check(random_cameras(3, spread=spread), grid, feature_size, rays_per_cell)
+
+
+@pytest.mark.parametrize("spread", [0.3, 6.0], ids=["inside", "outside"])
+def test_equals_the_pair_list_where_pictures_fill_a_part(random_cameras, spread):
+    picture = torch.tensor([[0.0, 0.0, 80.0, 60.0], [21.0, 0.0, 47.0, 60.0], [30.0, 20.0, 31.0, 21.0]])
+    cameras = replace(random_cameras(3, spread=spread), picture=picture.double())
+    grid = VoxelGrid((9, 5, 6), (4.1, 2.3, 2.7), torch.tensor([0.1, -0.2, 0.05], dtype=torch.float64))
+    _check(cameras, grid, (5, 9), 2)
+    nothing = replace(cameras, picture=torch.zeros(3, 4, dtype=torch.float64))
+    blocks, number = trace_blocks(*_on_device(nothing, grid), (5, 9), 2)
+    assert (len(blocks), int(number)) == (0, 0)
 
 
 def test_equals_the_pair_list_of_a_batch(random_cameras, generator):

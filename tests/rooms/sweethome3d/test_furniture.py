@@ -2,11 +2,13 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 from collections import Counter
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from raytran.data.shapenet.models import model_folder, read_mesh
 from raytran.errors import DataError
@@ -254,3 +256,18 @@ def test_both_splits_hold_every_class():
         for row in read_table().values()
     )
     assert {(held_out, name) for held_out in (False, True) for name in CLASSES} <= set(rows)
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_a_texture_of_another_kind_reaches_no_decoder(tmp_path, write_library, entry, monkeypatch):
+    picture = io.BytesIO()
+    Image.new("RGB", (2, 2), "red").save(picture, "EPS")
+    monkeypatch.setattr("PIL.EpsImagePlugin.Ghostscript", lambda *_, **__: pytest.fail("it was started"))
+    path = tmp_path / "Scopia.sh3f"
+    write_library(path, entry(1, "Scopia#chair"), **{"scopia/chair/cloth.png": picture.getvalue()})
+    report = import_furniture(path, tmp_path / "out", **QUIET)
+    text = (
+        model_folder(tmp_path / "out", *report.credits[0].model.split("/")) / "model_normalized.mtl"
+    ).read_text()
+    colors = [tuple(map(float, line.split()[1:])) for line in text.splitlines() if line.startswith("Kd")]
+    assert sorted(colors) == [(1, 0, 0), (1, 1, 1)]

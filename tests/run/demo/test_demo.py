@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from raytran.checkpoints.file import shipped_weights, write_checkpoint
 from raytran.checkpoints.metadata import checkpoint_metadata
+from raytran.data.locks import exclusive_lock
 from raytran.errors import ConfigError
 from raytran.run.demo.demo import _asked, demo
 from raytran.run.entry import compose
@@ -51,6 +52,15 @@ def test_a_network_of_ones_own_is_trusted_because_it_was_typed(tmp_path, mylab):
     write_checkpoint(tmp_path / "last.ckpt", {**metadata, "state_dict": state})
     asked = _asked(typed, build_data(cfg), tmp_path / "last.ckpt")
     assert type(asked["train"].model.backbone).__module__ == "mylab.nets"
+
+
+def test_two_demos_in_one_folder(tmp_path):
+    output = tmp_path / "demo"
+    with (
+        exclusive_lock(output / ".demo.lock", if_taken=ConfigError),
+        pytest.raises(ConfigError, match=r"another process makes the demo in .*demo \(number"),
+    ):
+        demo(config(output))
 
 
 @pytest.mark.slow

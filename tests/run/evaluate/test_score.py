@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import random
 
 import pytest
 from PIL import Image
@@ -14,6 +15,7 @@ from raytran.errors import ConfigError, DataError
 from raytran.pictures import accuracy_curves
 from raytran.run.entry import compose
 from raytran.run.evaluate.evaluate import evaluate
+from raytran.run.output import one_writer
 
 CHAIR, TABLE, SOFA, LAMP = "03001627", "04379243", "04256520", "03636649"
 UPRIGHT = (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0)
@@ -390,6 +392,36 @@ def test_bad_settings(files):
         run(files, predictions="empty")
     with pytest.raises(ConfigError, match="no earlier result"):
         run(files, output="csv")
+
+
+@pytest.mark.parametrize("spread", [0.0, 30.0])
+def test_one_file_of_many_rows_needs_memory_by_rows(files, command, spread):
+    """A table of all pairs of 5,000 rows took 29 GB; here are 1.5 GB beyond what torch itself maps."""
+    rng = random.Random(0)
+    rows = [
+        row(CHAIR, "c1", (rng.uniform(0, spread), rng.uniform(0, spread), 0), rng.choice([UPRIGHT, TURNED]))
+        for _ in range(5000)
+    ]
+    (files / "csv" / "a.csv").write_text("".join([ROWS[1], *rows]))
+    limit = (
+        "import resource; mapped = int(open('/proc/self/statm').read().split()[0]) * 4096;"
+        "resource.setrlimit(resource.RLIMIT_AS, (mapped + 3 * 2**29,) * 2)"
+    )
+    settings = ["predictions=csv", "annotations=annotations.json", "output=out", "num_resamples=10"]
+    done = command("evaluate", *settings, "protocol=all", folder=files, first=limit)
+    assert done.returncode == 0, done.stderr
+    found = json.loads((files / "out" / "metrics.json").read_text())
+    assert {"strict", "scan2cad", "vid2cad", "odam"} <= found.keys()
+    assert found["strict"]["per_class"]["table"]["n_good"] == 1
+
+
+def test_two_evaluations_into_one_folder(files):
+    with (
+        one_writer(files / "out", marker="metrics.json"),
+        pytest.raises(ConfigError, match=r"another process writes .*out \(number"),
+    ):
+        run(files, output="out")
+    assert not (files / "out").exists()
 
 
 def test_the_command_ends_with_one_sentence(files, command):

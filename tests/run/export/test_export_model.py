@@ -145,7 +145,7 @@ def test_the_file_and_not_its_claim_decides_how_much_memory_is_taken(trained, tm
     content = torch.load(trained.path, weights_only=True)
     shape = content["model"]["heads"]["shape"] | {"widths": [1 << 16, 1 << 15, 64, 32]}
     put(tmp_path / "huge.safetensors", content, heads=content["model"]["heads"] | {"shape": shape})
-    with pytest.raises(CheckpointError, match=r"huge\.safetensors \(preset tiny\) do not fit"):
+    with pytest.raises(CheckpointError, match=r"\(preset tiny\) do not fit"):
         raytran.load(tmp_path / "huge.safetensors")
 
 

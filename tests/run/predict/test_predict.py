@@ -16,12 +16,14 @@ from torch import nn
 
 from raytran.checkpoints.load import PredictionSettings
 from raytran.errors import CheckpointError, ConfigError, DataError
+from raytran.run.output import one_writer
 from raytran.run.predict import predict as module
 from raytran.run.predict import write_scene
 from raytran.structs import ObjectSet, ScenePrediction, Views
 from raytran.viewer import has_viser
 from raytran.viewer.data import read_viewer_scene
 
+from ...factories import digests
 from ...scan_forms import encode_sens, write_form
 
 IMAGE_SIZE = (48, 64)
@@ -247,6 +249,21 @@ def test_every_form_of_a_scan_gives_the_same_views(scene, oracle, tmp_path, form
     assert torch.equal(oracle.seen.images, expected.images)
     assert torch.equal(oracle.seen.intrinsics, expected.intrinsics)
     torch.testing.assert_close(oracle.seen.world_from_camera, expected.world_from_camera, rtol=0, atol=1e-6)
+
+
+def test_two_predictions_into_one_folder(scene, oracle, tmp_path):
+    output = module.predict(config(scene, tmp_path / "out"))
+    before = digests(output)
+    with (
+        one_writer(output, marker="scene.json"),
+        pytest.raises(ConfigError, match=r"another process writes .*out \(number \d+ on ") as raised,
+    ):
+        module.predict(config(scene, tmp_path / "out", score_threshold=0.2))
+    assert len(str(raised.value)) - len(str(output)) < 250
+    assert digests(output) == before
+    module.predict(config(scene, tmp_path / "out", score_threshold=0.2))
+    assert digests(output) != before
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
 
 
 def test_thresholds(scene, oracle, tmp_path):

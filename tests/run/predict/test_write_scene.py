@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import resource
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ import pytest
 import torch
 import trimesh
 
+from raytran.data.files import disk_full
 from raytran.data.shapenet.voxelize import voxelize_solid
 from raytran.export.read import read_alignments_csv, read_predictions
 from raytran.geometry.rotation import rotation_from_yaw
@@ -19,6 +21,8 @@ from raytran.rooms.cad import CadModel, sample_model
 from raytran.rooms.shapenet_files import write_model
 from raytran.run.predict.write_scene import PredictedScene, write_scene
 from raytran.structs import CLASSES, ObjectSet, ScenePrediction, Views
+
+from ...factories import digests
 
 FILES = {"scene.json", "scene.glb", "meshes", "occupancy.ply", "topdown.png", "overlays"}
 
@@ -65,6 +69,23 @@ def write(output: Path, found: PredictedScene, views: Views, turntable: int = 0)
         turntable=turntable,
     )
     return {path.name for path in output.iterdir()}
+
+
+def test_on_a_full_disk_the_folder_is_whole_or_as_it_was(tmp_path, found, views):
+    """Every file is cut short once, by a limit on its size, which is a full disk of its own kind."""
+    write(tmp_path / "room", found, views, turntable=1)
+    sizes = {path.stat().st_size for path in (tmp_path / "room").rglob("*") if path.is_file()}
+    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    before = digests(tmp_path)
+    for size in sorted(sizes):
+        resource.setrlimit(resource.RLIMIT_FSIZE, (size - 1, hard))
+        try:
+            with pytest.raises(OSError, match=r"File too large|encoder error") as raised:
+                write(tmp_path / "room", found, views, turntable=1)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (hard, hard))
+        assert disk_full(raised.value) is not None, raised.value
+        assert digests(tmp_path) == before
 
 
 def test_the_turntable_is_there_if_wanted(tmp_path, found, views):

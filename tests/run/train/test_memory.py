@@ -28,9 +28,12 @@ def test_the_settings_to_change_are_named(error, place):
     with pytest.raises(ConfigError) as caught, explained_out_of_memory(config()):
         raise error
     message = str(caught.value)
-    assert message.startswith(f"{place} does not suffice for a step: change views.batch_size (now 2:")
-    assert "views.num_views (now 12: fewer frames a scene)" in message
-    assert "views.image_size (now [240, 320]: smaller images)" in message
+    assert message.startswith(
+        f"{place} does not suffice for a step: change views.batch_size (now 2: fewer), or "
+    )
+    assert "views.num_views (now 12: fewer)" in message
+    assert "views.image_size (now [240, 320]: smaller)" in message
+    assert "…" not in message, "it is not too long"
 
 
 def test_what_has_nothing_to_give_is_not_named():

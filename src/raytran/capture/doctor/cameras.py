@@ -115,12 +115,22 @@ def check_cameras(raw: RawScan, matches: Matches) -> CameraCheck:
     # The stored reading comes first, then plain ones: among equals the first is taken.
     best = max(candidates, key=lambda candidate: round(score.share(candidate), 2))
     stored = score.share(Correction())
-    if not (score.share(best) > stored + _CLEARLY_BETTER and score.share(best) > _TIMES_BETTER * stored):
+    if not is_clearly_better(score.share(best), stored):
         best = Correction()
     best = _with_better_intrinsics(replace(best, intrinsics=None), scaled, score)
     agrees, depth = score.triangulate(best)
     findings = _findings(raw, best, len(matches), stored, float(agrees.mean()))
     return CameraCheck(best, findings, agrees, depth)
+
+
+def agreement(raw: RawScan, matches: Matches) -> float:
+    """Return the share of matches that agree with a scan's cameras as stored; 0 of too few matches."""
+    return _Score(raw, matches).share(Correction()) if len(matches) >= _MIN_MATCHES else 0.0
+
+
+def is_clearly_better(share: float, other: float) -> bool:
+    """Whether a share of agreeing matches is clearly larger than that of another reading."""
+    return share > other + _CLEARLY_BETTER and share > _TIMES_BETTER * other
 
 
 class _Score:
@@ -155,16 +165,16 @@ def _scaled_intrinsics(raw: RawScan) -> list[NDArray[np.float64]]:
     factor for both rows, from either side, is tried too, and the image centre with the focal length as it is.
     """
     height, width = raw.scan.image_size
-    matrix = raw.intrinsics
+    matrix = np.median(raw.intrinsics, axis=0)
     stated_width, stated_height = 2 * matrix[0, 2], 2 * matrix[1, 2]
     error = max(abs(stated_width / width - 1), abs(stated_height / height - 1))
     if min(stated_width, stated_height) <= 0 or error < _SAME:
         return []
     scale_x, scale_y = width / stated_width, height / stated_height
     factors = ((scale_x, scale_y), (scale_x, scale_x), (scale_y, scale_y))
-    centered = matrix.copy()
-    centered[:2, 2] = width / 2, height / 2
-    return [*(np.diag([x, y, 1.0]) @ matrix for x, y in factors), centered]
+    centered = raw.intrinsics.copy()
+    centered[:, :2, 2] = width / 2, height / 2
+    return [*(np.diag([x, y, 1.0]) @ raw.intrinsics for x, y in factors), centered]
 
 
 def _with_better_intrinsics(best: Correction, scaled: list[NDArray[np.float64]], score: _Score) -> Correction:
@@ -220,7 +230,7 @@ def _findings(
     else:
         axes = Finding("camera axes", "ok", text if best.intrinsics is None else with_fix)
     if best.intrinsics is None:
-        (fx, _, cx), (_, fy, cy), _ = raw.intrinsics
+        (fx, _, cx), (_, fy, cy), _ = np.median(raw.intrinsics, axis=0)
         fit = f"focal lengths {fx:.1f}, {fy:.1f} and centre {cx:.1f}, {cy:.1f} pixels fit"
         return axes, Finding("intrinsics", "ok", fit)
     advice = _intrinsics_advice(raw, best.intrinsics)
@@ -245,10 +255,10 @@ def _pose_advice(best: Correction) -> tuple[str, str]:
     return " and ".join(causes), ", then ".join(fixes)
 
 
-def _intrinsics_advice(raw: RawScan, right: NDArray[np.float64]) -> tuple[str, str]:
-    """Return cause and fix of intrinsics that must be corrected to ``right``."""
+def _intrinsics_advice(raw: RawScan, corrected: NDArray[np.float64]) -> tuple[str, str]:
+    """Return cause and fix of intrinsics that must be corrected, with the medians of all frames'."""
     height, width = raw.scan.image_size
-    stored = raw.intrinsics
+    stored, right = np.median(raw.intrinsics, axis=0), np.median(corrected, axis=0)
     scale_x, scale_y = stored[0, 2] / right[0, 2], stored[1, 2] / right[1, 2]
     center_moved = max(abs(scale_x - 1), abs(scale_y - 1)) > _SAME
     if center_moved and abs(right[0, 0] / stored[0, 0] - 1) < _SAME:

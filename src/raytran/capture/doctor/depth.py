@@ -47,13 +47,18 @@ class SurfacePoints:
 
 
 def points_from_matches(matches: Matches, depth: NDArray, intrinsics: NDArray) -> SurfacePoints:
-    """Return matched points, seen by their first frames at ``depth`` ``(n,)``."""
-    rays = _rays(matches.pixel[:, 0], intrinsics)
+    """Return matched points, seen by their first frames at ``depth`` ``(n,)``; intrinsics of all frames."""
+    rays = _rays(matches.pixel[:, 0], intrinsics[matches.frame[:, 0]])
     return SurfacePoints(matches.frame[:, 0], rays, depth, "points seen twice")
 
 
 def points_from_depth_maps(raw: RawScan, intrinsics: NDArray) -> SurfacePoints | None:
-    """Return samples of a scan's depth maps, registered with the colour images; None if it has none."""
+    """Return samples of a scan's depth maps, registered with the colour images; None if it has none.
+
+    Args:
+        raw: the scan.
+        intrinsics: ``(frames, 3, 3)`` of all its frames.
+    """
     with_depth = raw.frames_with_depth()
     chosen = with_depth[:: max(1, len(with_depth) // _MAX_FRAMES)][:_MAX_FRAMES]
     frames, pixels, depths = [], [], []
@@ -71,7 +76,7 @@ def points_from_depth_maps(raw: RawScan, intrinsics: NDArray) -> SurfacePoints |
         depths.append(values[is_known])
     if not frames:
         return None
-    rays = _rays(np.concatenate(pixels), intrinsics)
+    rays = _rays(np.concatenate(pixels), intrinsics[np.concatenate(frames)])
     return SurfacePoints(np.concatenate(frames), rays, np.concatenate(depths), "depth maps")
 
 
@@ -95,5 +100,6 @@ def depth_of_matches(raw: RawScan, matches: Matches) -> NDArray[np.float64] | No
 
 
 def _rays(pixel: NDArray, intrinsics: NDArray) -> NDArray[np.float64]:
-    """Return directions ``(n, 3)`` in camera axes, z = 1, of pixels ``(n, 2)``."""
-    return np.concatenate([pixel, np.ones((len(pixel), 1))], axis=1) @ np.linalg.inv(intrinsics).T
+    """Return directions ``(n, 3)`` in camera axes, z = 1, of pixels ``(n, 2)``, each with its intrinsics."""
+    homogeneous = np.concatenate([pixel, np.ones((len(pixel), 1))], axis=1)
+    return np.einsum("nij,nj->ni", np.linalg.inv(intrinsics), homogeneous)

@@ -34,7 +34,7 @@ from raytran.data.scan import OpenScan
 from raytran.data.scan2cad import SceneAnnotation, scene_objects
 from raytran.data.scannet.find import ScanSource
 from raytran.data.scannet.layout import find_layout
-from raytran.data.scannet.text import are_rigid, read_matrix
+from raytran.data.scannet.text import are_rigid, read_pose
 from raytran.errors import DataError
 from raytran.structs import ObjectSet
 
@@ -251,7 +251,7 @@ def _unopened(path: Path, error: DataError) -> Finding:
 def _is_left_handed(path: Path) -> bool:
     """Whether most pose files hold an orthonormal matrix of determinant -1."""
     try:
-        matrices = [read_matrix(file) for file in list(find_layout(path).poses().values())[:50]]
+        matrices = [read_pose(file) for file in list(find_layout(path).poses().values())[:50]]
     except DataError:
         return False
     rotations = [matrix[:3, :3] for matrix in matrices if matrix is not None and np.isfinite(matrix).all()]

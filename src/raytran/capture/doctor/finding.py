@@ -48,7 +48,7 @@ class Correction:
         camera_rotation: ``(3, 3)`` rotation of the camera axes, applied on the right.
         scale: metres per stored unit.
         world_transform: ``(4, 4)`` right_world_from_stored_world.
-        intrinsics: ``(3, 3)`` for the stored image size, or None if the stored ones are right.
+        intrinsics: ``(n, 3, 3)`` for the stored image size, or None if the stored ones are right.
     """
 
     storage: Storage = "as stored"

@@ -16,6 +16,9 @@ _WIDTH = 480
 _TOLERANCE_PX = 1.5
 """Largest distance of a match from its epipolar line, pixels of an image ``_WIDTH`` wide."""
 
+_PATCH = 16
+"""Pixels around a point that ORB reads, about."""
+
 _NUM_POINTS = 600
 _NUM_STARTS = 14
 _ENOUGH = 1500
@@ -46,7 +49,12 @@ class Matches:
         return len(self.frame)
 
 
-def match_frames(read_grey: Callable[[int, int], tuple[NDArray, float]], num_frames: int) -> Matches:
+def match_frames(
+    read_grey: Callable[[int, int], tuple[NDArray, float]],
+    num_frames: int,
+    *,
+    picture: NDArray[np.float64] | None = None,
+) -> Matches:
     """Match points between frames that are near in time, at places spread over the scan.
 
     The gap between two frames follows from the images: it grows until points move enough to tell depth and
@@ -55,8 +63,10 @@ def match_frames(read_grey: Callable[[int, int], tuple[NDArray, float]], num_fra
     Args:
         read_grey: gives frame i at most W columns wide in [0, 1], and its size relative to the stored one.
         num_frames: frames of the scan.
+        picture: ``(num_frames, 4)`` left, top, right and bottom of what each frame shows, pixels of the
+            stored image, outside of which no points are sought; None: all of it.
     """
-    matcher = _Matcher(read_grey)
+    matcher = _Matcher(read_grey, picture)
     gap, count = 1, 0
     pairs: list[tuple[int, int, NDArray]] = []
     for start in _spread_starts(num_frames):
@@ -103,7 +113,7 @@ def triangulate(
     Args:
         matches: n of them.
         world_from_camera: ``(frames, 4, 4)``.
-        intrinsics: ``(3, 3)``.
+        intrinsics: ``(frames, 3, 3)``.
 
     Returns:
         ``(n,)`` bool, and ``(n,)`` depths in the first frame, unit of the poses.
@@ -112,15 +122,15 @@ def triangulate(
     relative = np.linalg.inv(second) @ first
     rotation, translation = relative[:, :3, :3], relative[:, :3, 3]
     rays = np.concatenate([matches.pixel, np.ones((*matches.pixel.shape[:2], 1))], axis=2)
-    rays = rays @ np.linalg.inv(intrinsics).T
+    rays = np.einsum("npij,npj->npi", np.linalg.inv(intrinsics)[matches.frame], rays)
     # Both rays in the axes of the second camera.
     first_ray, second_ray = np.einsum("nij,nj->ni", rotation, rays[:, 0]), rays[:, 1]
     # Sampson distance: the epipolar residual over its slope in the pixels of both images.
     line = np.cross(translation, first_ray)
     residual = np.abs((line * second_ray).sum(axis=1))
     line_in_first = np.einsum("nji,nj->ni", rotation, np.cross(second_ray, translation))
-    focal = np.array([intrinsics[0, 0], intrinsics[1, 1]])
-    slope = np.concatenate([line[:, :2] / focal, line_in_first[:, :2] / focal], axis=1)
+    focal = intrinsics[matches.frame][:, :, [0, 1], [0, 1]]
+    slope = np.concatenate([line[:, :2] / focal[:, 1], line_in_first[:, :2] / focal[:, 0]], axis=1)
     distance = residual / np.maximum(np.linalg.norm(slope, axis=1), 1e-12)
     # Depths at which the rays are closest to each other.
     normal = np.cross(first_ray, second_ray)
@@ -134,8 +144,10 @@ def triangulate(
 class _Matcher:
     """Matches ORB features (Rublee et al. 2011) of two frames; those of a frame are computed once."""
 
-    def __init__(self, read_grey: Callable[[int, int], tuple[NDArray, float]]) -> None:
-        self._read_grey = read_grey
+    def __init__(
+        self, read_grey: Callable[[int, int], tuple[NDArray, float]], picture: NDArray[np.float64] | None
+    ) -> None:
+        self._read_grey, self._picture = read_grey, picture
         self._features: dict[int, tuple[NDArray, NDArray]] = {}
         self.factor, self.width = 1.0, _WIDTH
 
@@ -156,8 +168,17 @@ class _Matcher:
                 detector.detect_and_extract(grey)
                 # Points are given as (row, column) of pixel centres; (0, 0) is the corner of the image here.
                 points = (detector.keypoints[:, ::-1] + 0.5) / self.factor
-                self._features[frame] = points, detector.descriptors
+                inside = self._is_inside(frame, points)
+                self._features[frame] = points[inside], detector.descriptors[inside]
             except (RuntimeError, ValueError, IndexError):
                 # What scikit-image raises when an image has no corners.
                 self._features[frame] = np.zeros((0, 2)), np.zeros((0, 256), dtype=bool)
         return self._features[frame]
+
+    def _is_inside(self, frame: int, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """Return which points are so far inside a frame's picture that their patch is, ``(n,)``."""
+        if self._picture is None:
+            return np.ones(len(points), dtype=np.bool_)
+        low, high = self._picture[frame, :2], self._picture[frame, 2:]
+        margin = _PATCH / self.factor
+        return np.asarray(((points >= low + margin) & (points < high - margin)).all(axis=1))

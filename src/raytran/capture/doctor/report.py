@@ -75,7 +75,7 @@ class CameraReading:
 
     Attributes:
         world_from_camera: ``(n, 4, 4)``.
-        intrinsics: ``(3, 3)`` for the stored images.
+        intrinsics: ``(n, 3, 3)`` for the stored images.
         points: ``(p, 3)`` what the images show, in the same world and unit.
     """
 
@@ -203,7 +203,7 @@ def frames_to_show(
     if not len(examination.objects):
         return [int(section[len(section) // 2]) for section in sections]
     batched = Cameras(
-        torch.from_numpy(cameras.intrinsics).expand(n, 3, 3),
+        torch.from_numpy(cameras.intrinsics),
         torch.from_numpy(cameras.world_from_camera),
         image_size,
     )
@@ -242,7 +242,7 @@ def draw_frames(
         except DataError:
             picture = Image.new("RGB", size[::-1], (90, 90, 90))
         camera = Cameras(
-            torch.from_numpy(cameras.intrinsics),
+            torch.from_numpy(cameras.intrinsics[frame]),
             torch.from_numpy(cameras.world_from_camera[frame]),
             (height, width),
         ).scaled_to(size)
@@ -308,10 +308,10 @@ def _draw_panel(
 def _draw_up(axes: Axes, cameras: CameraReading) -> None:
     """Draw where up is by the cameras, at the mean camera; nothing if they do not tell."""
     poses = cameras.world_from_camera
-    measured, _ = measured_up(poses)
+    measured = measured_up(poses)
     if measured is None:
         return
-    up, start = measured[[0, 2]], poses[:, :3, 3].mean(axis=0)[[0, 2]]
+    up, start = measured.direction[[0, 2]], poses[:, :3, 3].mean(axis=0)[[0, 2]]
     low, high = axes.get_ylim()
     length = 0.3 * (high - low)
     tip = float(start[1] + 1.25 * length * up[1])

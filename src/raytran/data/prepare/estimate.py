@@ -14,13 +14,12 @@ from functools import partial
 from pathlib import Path
 from statistics import fmean, median
 
-from raytran.data.files import UNFINISHED, bytes_below
+from raytran.data.files import bytes_below, unfinished_name
 from raytran.data.prepare.annotation import used_models, without_models
 from raytran.data.prepare.report import gigabytes
 from raytran.data.prepare.scan import PrepareSettings, ScanJob, choose_frames, encoded_frame
 from raytran.data.prepare.targets import prepare_model, write_masks
 from raytran.errors import DataError
-from raytran.geometry.camera import Cameras
 
 _SAMPLES = 3
 """Number of models, of scans, and of frames of each of these scans that are prepared for the estimate."""
@@ -77,7 +76,7 @@ def estimate(
     """
     counts = [_num_frames(jobs[i], settings) for i in choose_frames(len(jobs), _SCANS_COUNTED)]
     frames = round(fmean(counts) * len(jobs)) if counts else 0
-    with tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=output) as folder:
+    with tempfile.TemporaryDirectory(prefix=f"{unfinished_name()}-", dir=output) as folder:
         trial = Path(folder)
         model_cost = frame_cost = (0.0, 0.0)
         if shapenet is not None:
@@ -133,8 +132,6 @@ def _frame_cost(
         chosen = choose_frames(len(scan), _SAMPLES)
         written = sum(len(encoded_frame(scan, position, settings.image_size)[0]) for position in chosen)
         if entry is not None:
-            intrinsics = scan.intrinsics.expand(len(chosen), 3, 3)
-            cameras = Cameras(intrinsics, scan.world_from_camera[chosen], scan.image_size)
-            write_masks(entry, cameras.scaled_to(settings.image_size), trial)
+            write_masks(entry, scan.cameras[chosen].scaled_to(settings.image_size), trial)
     seconds = time.perf_counter() - started
     return (written + bytes_below(trial) - before) / len(chosen), seconds / len(chosen)

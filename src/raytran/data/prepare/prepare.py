@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from raytran.data.cache import file_digest
-from raytran.data.files import UNFINISHED, SettingsRecord, exclusive_lock, sweep, write_json, write_text
+from raytran.data.files import UNFINISHED, SettingsRecord, sweep, write_json, write_text
+from raytran.data.locks import exclusive_lock
 from raytran.data.prepare.annotation import ANNOTATIONS, Entry, used_models, without_models
 from raytran.data.prepare.estimate import estimate
 from raytran.data.prepare.report import Outcome, make_report, report_text
@@ -32,6 +33,7 @@ FORMAT = "raytran.prepared/1"
 MARKER = "prepare.json"
 """File with the settings that a prepared folder was begun with."""
 
+_LOCK = ".prepare.lock"
 _UNFINISHED = (
     f"{UNFINISHED}*",
     f"scannet/{UNFINISHED}*",
@@ -130,15 +132,20 @@ def claimed(output: Path, settings: PrepareSettings, sources: dict[str, Any]) ->
         raise DataError(
             f"{output} holds other things than prepared data: choose a folder that does not exist yet"
         )
-    different = record.begin({"format": FORMAT, **asdict(settings), **sources})
-    if different:
-        raise DataError(
-            f"{record.path} says that the folder was begun with another {', '.join(different)}; "
-            "choose another output folder or remove this one"
-        )
-    busy = DataError(f"another process prepares {output}: wait for it to end, or choose another folder")
-    with exclusive_lock(record.path, if_taken=busy):
+    with exclusive_lock(output / _LOCK, if_taken=partial(_taken, output)):
+        different = record.begin({"format": FORMAT, **asdict(settings), **sources})
+        if different:
+            raise DataError(
+                f"{record.path} says that the folder was begun with another {', '.join(different)}; "
+                "choose another output folder or remove this one"
+            )
         yield
+
+
+def _taken(output: Path, who: str) -> DataError:
+    return DataError(
+        f"another process prepares {output} ({who}): wait for it to end, or choose another folder"
+    )
 
 
 @dataclass

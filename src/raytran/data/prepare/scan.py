@@ -90,10 +90,7 @@ def prepare_scan(job: ScanJob, output: Path, settings: PrepareSettings) -> tuple
                 _write_scan(source, folder, settings, tried=reasons)
                 if settings.masks and job.entry is not None:
                     # As a data set sees the cameras: through the files.
-                    scan = read_scan(folder)
-                    intrinsics = scan.intrinsics.expand(len(scan), 3, 3)
-                    cameras = Cameras(intrinsics, scan.world_from_camera, settings.image_size)
-                    write_masks(job.entry, cameras, output)
+                    write_masks(job.entry, read_scan(folder).cameras, output)
             return job.scene_id, None
         except (DataError, OSError) as error:
             check_disk(error, output)
@@ -129,8 +126,8 @@ def _write_scan(source: ScanSource, folder: Path, settings: PrepareSettings, *, 
                 "copy or export the scan again"
             )
         pose = scan.world_from_camera[used]
-        cameras = Cameras(scan.intrinsics.expand(len(used), 3, 3), pose, scan.image_size)
-        _write_camera_facts(folder, cameras.scaled_to(settings.image_size), scan.axis_alignment)
+        cameras = scan.cameras[used].scaled_to(settings.image_size)
+        _write_camera_facts(folder, cameras, scan.axis_alignment)
         write_json(
             folder / FACTS,
             {

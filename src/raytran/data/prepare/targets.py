@@ -6,6 +6,8 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import torch
+
 from raytran.data.cache import MaskCache
 from raytran.data.files import disk_full
 from raytran.data.prepare.annotation import NO_CAD, Entry
@@ -59,9 +61,7 @@ def write_masks(entry: Entry, cameras: Cameras, output: Path) -> None:
     objects = scene_objects(parse_entry(entry))
     cache = MaskCache(folder=output / "cache")
     for start in range(0, len(cameras.intrinsics), _MASKS_AT_ONCE):
-        frames = slice(start, start + _MASKS_AT_ONCE)
-        intrinsics, pose = cameras.intrinsics[frames].float(), cameras.world_from_camera[frames].float()
-        chunk = Cameras(intrinsics, pose, cameras.image_size)
+        chunk = cameras[start : start + _MASKS_AT_ONCE].to(torch.float32)
         foreground_masks(objects, chunk, shapenet_root=output / "shapenet", cache=cache)
 
 

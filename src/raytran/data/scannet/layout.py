@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from raytran.data.images import IMAGE_ENDINGS
 from raytran.data.scannet.text import INFO_FILES
 from raytran.errors import DataError
 
@@ -36,9 +37,16 @@ _INTRINSICS = (
     "intrinsics_color.txt",
     "intrinsic_color.txt",
     "intrinsic.txt",
+    "intrinsics.txt",
+    "camera-intrinsics.txt",
     *INFO_FILES,
 )
-_IMAGE_ENDINGS = (".png", ".jpeg", ".jpg")
+"""Files of intrinsics: ScanNet's tools write the first and the last, users of 7-Scenes and the demo of TSDF
+fusion the others."""
+
+_DEPTH_INTRINSICS = ("intrinsic/intrinsic_depth.txt", "intrinsics/intrinsic_depth.txt", "intrinsic_depth.txt")
+
+_IMAGE_ENDINGS = IMAGE_ENDINGS[::-1]
 """Where a frame comes in several, the last one counts."""
 _CPP_FRAME = re.compile(r"frame-(\d+)\.(color|pose)\.(\w+)")
 _FLAT_FRAME = re.compile(r"(\d+)\.(\w+)")
@@ -112,11 +120,29 @@ class Layout:
             self._flat((".txt",)) if self.form == "mmdetection3d" else _by_stem(self.base / "pose", (".txt",))
         )
 
+    @property
+    def is_aligned(self) -> bool:
+        """Whether +z is up in the form's worlds.
+
+        ``cpp`` without its file of facts is that of 7-Scenes and of TSDF fusion, whose worlds are those of
+        the first camera.
+        """
+        facts = (folder / name for folder in (self.base, self.scan) for name in INFO_FILES)
+        return self.form != "cpp" or any(path.is_file() for path in facts)
+
     def intrinsics(self) -> Path:
-        """Return the first file of intrinsics that is there, or where the exporter would write it."""
-        folders = dict.fromkeys((self.base, self.scan))
-        paths = (folder / name for folder in folders for name in _INTRINSICS)
+        """Return the first file of intrinsics that is there, or where the exporter would write it.
+
+        The sequences of 7-Scenes may share one that lies above them.
+        """
+        folders = [self.base, self.scan, *([] if self.is_aligned else [self.scan.absolute().parent])]
+        paths = (folder / name for folder in dict.fromkeys(folders) for name in _INTRINSICS)
         return next((path for path in paths if path.is_file()), self.base / _INTRINSICS[0])
+
+    def depth_intrinsics(self) -> Path | None:
+        """Return the file of the depth camera's intrinsics, None if there is none."""
+        paths = (folder / name for folder in (self.base, self.scan) for name in _DEPTH_INTRINSICS)
+        return next((path for path in paths if path.is_file()), None)
 
     def num_images(self) -> int:
         """Return the number of colour images without opening any."""

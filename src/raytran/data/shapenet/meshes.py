@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from raytran.errors import DataError
+from raytran.data.images import UNREADABLE, open_image
+from raytran.errors import ConfigError, DataError
 from raytran.limits import COORDINATE, VOXEL_CUBE, as_number, as_numbers, shown
 
 _log = logging.getLogger(__name__)
@@ -279,11 +280,11 @@ def _inside(mtl: Path, name: str) -> Path | None:
 def _mean_color(path: Path) -> tuple[float, float, float] | None:
     """Return a texture's mean colour, or None if it cannot be read."""
     try:
-        with Image.open(path) as image:
+        with open_image(path) as image:
             if image.width * image.height > _MAX_TEXTURE_PIXELS:
                 return None
             pixel = np.asarray(image.convert("RGB").resize((1, 1), Image.Resampling.BOX))[0, 0]
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+    except (*UNREADABLE, ConfigError):
         return None
     red, green, blue = (pixel / 255).tolist()
     return (red, green, blue)

@@ -15,6 +15,18 @@ from raytran.structs import SYMMETRY_INFINITE, ObjectSet
 SCAN2CAD_LIMITS = (0.2, 20.0, 0.2)
 """Largest translation, rotation and scale error of an object that counts as found: metres, degrees, ratio."""
 
+_PAIRS_AT_ONCE = 65_536
+"""Pairs whose intermediate values, about a kilobyte each, are in memory together."""
+
+
+def row_blocks(num_rows: int, num_columns: int, *, pairs: int = _PAIRS_AT_ONCE) -> list[slice]:
+    """Return parts of the rows of a table of pairs that are small enough to be worked on together.
+
+    A table of ordinary size is one part, and so is one without rows.
+    """
+    step = max(pairs // max(num_columns, 1), 1)
+    return [slice(start, start + step) for start in range(0, max(num_rows, 1), step)]
+
 
 class AlignmentErrors(NamedTuple):
     """Errors of every prediction against every true object, each ``(P, M)``.
@@ -60,12 +72,16 @@ def symmetric_rotation_error(predicted: Tensor, target: Tensor, symmetry: Tensor
     """
     quarter = torch.arange(4, device=target.device)
     turned = target @ _turns_about_up(quarter * (math.pi / 2), target.dtype)[:, None]
-    angle = geodesic_angle(predicted[:, None, None], turned)
     equal = (quarter[:, None] * symmetry) % 4 == 0
-    finite = torch.where(equal, angle, torch.inf).amin(dim=1)
-    up_distance = (predicted[:, None, :, 1] - target[:, :, 1]).norm(dim=-1)
-    between_up = 2 * torch.asin((up_distance / 2).clamp(max=1.0))
-    return torch.rad2deg(torch.where(symmetry == SYMMETRY_INFINITE, between_up, finite))
+
+    def error(predicted: Tensor) -> Tensor:
+        angle = geodesic_angle(predicted[:, None, None], turned)
+        finite = torch.where(equal, angle, torch.inf).amin(dim=1)
+        up_distance = (predicted[:, None, :, 1] - target[:, :, 1]).norm(dim=-1)
+        between_up = 2 * torch.asin((up_distance / 2).clamp(max=1.0))
+        return torch.rad2deg(torch.where(symmetry == SYMMETRY_INFINITE, between_up, finite))
+
+    return torch.cat([error(predicted[part]) for part in row_blocks(len(predicted), len(target))])
 
 
 def _turns_about_up(angle: Tensor, dtype: torch.dtype) -> Tensor:

@@ -9,7 +9,7 @@ from collections.abc import Iterable, Sequence
 import torch
 from torch import Tensor
 
-from raytran.metrics.functional.alignment import AlignmentErrors
+from raytran.metrics.functional.alignment import AlignmentErrors, row_blocks
 from raytran.structs import SYMMETRY_INFINITE, CadAlignments
 
 _COMB = 36
@@ -34,12 +34,23 @@ def cad_errors(
         symmetry: ``(P, M)`` int64, over whose turns the rotation error is the least.
         dtype: precision in which translation and scale are compared.
     """
-    shift = predictions.translation.to(dtype)[:, None] - target_point.to(dtype)
-    x, y, z = (shift * shift).unbind(dim=-1)
-    first, second, third = (predictions.scale.to(dtype)[:, None] / targets.scale.to(dtype)).unbind(dim=-1)
-    scale = ((first + second + third) / 3 - 1).abs()
+    translation = shift_error(predictions.translation.to(dtype), target_point.to(dtype))
+    scale = scale_error(predictions.scale.to(dtype), targets.scale.to(dtype))
     rotation = comb_rotation_error(predictions.quaternion, targets.quaternion, symmetry)
-    return AlignmentErrors((x + y + z).sqrt().double(), rotation, scale.double())
+    return AlignmentErrors(translation, rotation, scale)
+
+
+def shift_error(predicted: Tensor, target: Tensor) -> Tensor:
+    """Return distances, computed in the type of the inputs, ``(P, 3)``, ``(M, 3)`` → ``(P, M)`` float64."""
+    shift = predicted[:, None] - target
+    x, y, z = (shift * shift).unbind(dim=-1)
+    return (x + y + z).sqrt().double()
+
+
+def scale_error(predicted: Tensor, target: Tensor) -> Tensor:
+    """Return the error of the mean ratio, computed and returned as ``shift_error``."""
+    first, second, third = (predicted[:, None] / target).unbind(dim=-1)
+    return ((first + second + third) / 3 - 1).abs().double()
 
 
 def comb_rotation_error(predicted: Tensor, target: Tensor, symmetry: Tensor) -> Tensor:
@@ -56,18 +67,39 @@ def comb_rotation_error(predicted: Tensor, target: Tensor, symmetry: Tensor) -> 
     Returns:
         ``(P, M)`` degrees.
     """
-    step = torch.arange(_COMB, device=target.device)
-    half = step.to(target.dtype) * (math.pi / _COMB)
+    turned = comb_of_turns(target)
+    return torch.cat(
+        [
+            least_comb_angle(predicted[part, None], turned, symmetry[part])
+            for part in row_blocks(len(predicted), len(target))
+        ]
+    )
+
+
+def comb_of_turns(target: Tensor) -> Tensor:
+    """Return quaternions turned about +Y in steps of ten degrees, ``(M, 4)`` → ``(M, 36, 4)``."""
+    half = torch.arange(_COMB, device=target.device).to(target.dtype) * (math.pi / _COMB)
     cos, sin = torch.cos(half), torch.sin(half)
     w, x, y, z = (column[:, None] for column in target.unbind(dim=-1))
-    rotated = torch.stack(
-        [w * cos - y * sin, x * cos - z * sin, y * cos + w * sin, z * cos + x * sin], dim=-1
-    )
-    overlap = (predicted[:, None, None] * rotated).sum(dim=-1).abs()
+    return torch.stack([w * cos - y * sin, x * cos - z * sin, y * cos + w * sin, z * cos + x * sin], dim=-1)
+
+
+def least_comb_angle(predicted: Tensor, turned: Tensor, symmetry: Tensor) -> Tensor:
+    """Return the least angle to one of the turns of a symmetry; see ``comb_rotation_error``.
+
+    Args:
+        predicted: ``(..., 4)``.
+        turned: ``(..., 36, 4)``, from ``comb_of_turns``.
+        symmetry: ``(...)`` int64.
+
+    Returns:
+        ``(...)`` degrees, the shapes broadcast.
+    """
+    overlap = (predicted[..., None, :] * turned).sum(dim=-1).abs()
     angle = torch.rad2deg(2 * torch.acos(overlap))
     angle = torch.where(overlap > 1, 0.0, angle)
     count = torch.where(symmetry == SYMMETRY_INFINITE, _COMB, symmetry)[..., None]
-    tried = (step * count) % _COMB == 0
+    tried = (torch.arange(_COMB, device=turned.device) * count) % _COMB == 0
     return torch.where(tried, angle, torch.inf).amin(dim=-1)
 
 

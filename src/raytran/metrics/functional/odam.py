@@ -10,6 +10,7 @@ from torch import Tensor
 
 from raytran.errors import ShapeError
 from raytran.geometry.rotation import matrix_from_quaternion
+from raytran.metrics.functional.alignment import row_blocks
 from raytran.structs import CLASS_BY_CATID, CadAlignments
 
 _SMALLEST_SCALE = 1e-3
@@ -81,7 +82,10 @@ def bev_iou(first: Tensor, second: Tensor) -> Tensor:
     Returns:
         ``(A, B)``; zero where a corner is not finite or a volume is zero.
     """
-    area = _shared_area(first[:, :4, :2], second[:, :4, :2])
+    outlines = first[:, :4, :2], second[:, :4, :2]
+    area = torch.cat(
+        [_shared_area(outlines[0][part], outlines[1]) for part in row_blocks(len(first), len(second))]
+    )
     top = torch.minimum(first[:, None, 0, 2], second[:, 0, 2])
     bottom = torch.maximum(first[:, None, 4, 2], second[:, 4, 2])
     shared = area * (top - bottom).clamp(min=0)

@@ -10,8 +10,15 @@ import torch
 from torch import Tensor
 
 from raytran.errors import ShapeError
-from raytran.metrics.functional.alignment import AlignmentErrors
-from raytran.metrics.functional.cad_errors import cad_errors, equal_names
+from raytran.metrics.functional.alignment import AlignmentErrors, row_blocks
+from raytran.metrics.functional.cad_errors import (
+    cad_errors,
+    comb_of_turns,
+    equal_names,
+    least_comb_angle,
+    scale_error,
+    shift_error,
+)
 from raytran.metrics.functional.detection import match_in_order
 from raytran.structs import CLASS_BY_CATID, CadAlignments
 
@@ -20,6 +27,9 @@ VID2CAD_CLASS_BY_CATID: dict[str, str] = {**CLASS_BY_CATID, "02818832": "bed"}
 
 _DUPLICATE_LIMITS = (0.4, 60.0, 0.6)
 """Two detections are one object within these metres, degrees and ratio of scale."""
+
+_ROWS_AT_ONCE = (16, 128)
+"""Rows of the table of all pairs that are made first, when most may still be duplicates, and at most."""
 
 
 def match_vid2cad(
@@ -70,11 +80,13 @@ def _in_float32(alignments: CadAlignments) -> CadAlignments:
 
 def _counts(ranked: CadAlignments, symmetry: Tensor, left: Counter[str]) -> Tensor:
     """Return which predictions are neither duplicates nor too many of their category, best first."""
-    close = _close(ranked, symmetry)
+    groups: dict[str, list[int]] = {}
+    for index, catid in enumerate(ranked.catid):
+        groups.setdefault(catid, []).append(index)
     alive = torch.ones(len(ranked), dtype=torch.bool)
-    for index in range(len(ranked)):
-        if alive[index]:
-            alive[index + 1 :] &= ~close[index, index + 1 :]
+    for group in groups.values():
+        members = torch.tensor(group)
+        alive[members] = _without_duplicates(ranked.select(members), symmetry[members])
     left = left.copy()
     counts = []
     for catid, is_alive in zip(ranked.catid, alive.tolist(), strict=True):
@@ -83,10 +95,28 @@ def _counts(ranked: CadAlignments, symmetry: Tensor, left: Counter[str]) -> Tens
     return torch.tensor(counts, dtype=torch.bool)
 
 
-def _close(ranked: CadAlignments, symmetry: Tensor) -> Tensor:
-    """Return whether the second is a duplicate of the first, ``(P, P)``, by the symmetry of the first."""
+def _without_duplicates(ranked: CadAlignments, symmetry: Tensor) -> Tensor:
+    """Return which of one category are no duplicate of a better one that is none itself, ``(P,)`` bool.
+
+    Some rows of the table of all pairs are made at a time, and angles, the greatest work, only of pairs that
+    are near and alike in size: a file may have any number of rows.
+    """
+    translation, scale = ranked.translation.float(), ranked.scale.float()
     unit = torch.nn.functional.normalize(ranked.quaternion.float(), dim=-1).double()
-    turned = replace(ranked, quaternion=unit)
-    turns = symmetry[:, None].expand(-1, len(ranked))
-    errors = cad_errors(turned, turned, ranked.translation, turns, torch.float32)
-    return equal_names(ranked.catid, ranked.catid) & errors.within(*_DUPLICATE_LIMITS)
+    alive = torch.ones(len(ranked), dtype=torch.bool)
+    begin, (count, most) = 0, _ROWS_AT_ONCE
+    while len(rows := begin + alive[begin:].nonzero().squeeze(1)[:count]):
+        begin, count = int(rows[-1]) + 1, min(2 * count, most)
+        later = int(rows[0]) + alive[rows[0] :].nonzero().squeeze(1)
+        near = shift_error(translation[rows], translation[later]) <= _DUPLICATE_LIMITS[0]
+        near &= scale_error(scale[rows], scale[later]) <= _DUPLICATE_LIMITS[2]
+        near &= later > rows[:, None]
+        row, column = near.nonzero().unbind(dim=1)
+        for part in row_blocks(len(row), 1):
+            first, second = rows[row[part]], later[column[part]]
+            angle = least_comb_angle(unit[first], comb_of_turns(unit[second]), symmetry[first])
+            near[row[part], column[part]] = angle <= _DUPLICATE_LIMITS[1]
+        for index, duplicates in zip(rows.tolist(), near, strict=True):
+            if alive[index]:
+                alive[later[duplicates]] = False
+    return alive

@@ -13,6 +13,7 @@ import trimesh
 from numpy.typing import NDArray
 from PIL import Image
 
+from raytran.data.images import IMAGE_KINDS
 from raytran.errors import DataError
 from raytran.rooms.sweethome3d.catalogue import FurnitureLibrary, Piece
 
@@ -118,8 +119,11 @@ def _color(part: trimesh.Trimesh) -> NDArray[np.float64]:
     material = getattr(visual, "material", None)
     if material is None:
         return _GREY
-    image, uv = getattr(material, "image", None), getattr(visual, "uv", None)
-    if image is None or uv is None or image.width * image.height > _LARGEST_TEXTURE:
+    image: Any = getattr(material, "image", None)
+    uv: Any = getattr(visual, "uv", None)
+    # trimesh opens files of any kind; nothing of them is decoded before this.
+    is_readable = image is not None and image.format in IMAGE_KINDS
+    if uv is None or not is_readable or image.width * image.height > _LARGEST_TEXTURE:
         return np.asarray(material.main_color, dtype=np.float64)[:3] / 255
     texture = np.asarray(image.convert("RGB").resize((_TEXTURE_SIDE, _TEXTURE_SIDE), Image.Resampling.BOX))
     middle = np.nan_to_num(np.asarray(uv)[part.faces].mean(axis=1)) % 1.0

@@ -19,14 +19,16 @@ from raytran.checkpoints.file import shipped_weights
 from raytran.checkpoints.load import load_model, prediction_settings
 from raytran.checkpoints.network import own_packages
 from raytran.data.files import SettingsRecord, write_json
+from raytran.data.locks import exclusive_lock
 from raytran.data.text import read_json_object
 from raytran.errors import ConfigError, DataError
 from raytran.limits import SECONDS, as_number
 from raytran.model import RayTran
 from raytran.run.demo.page import COLUMNS, ShownScene, headline, write_page
-from raytran.run.entry import compose, quoted
+from raytran.run.entry import compose
 from raytran.run.evaluate.evaluate import TASKS_WITH_SHAPE, about_data, evaluate_model
 from raytran.run.evaluate.results import write_evaluation
+from raytran.run.path_settings import quoted
 from raytran.run.predict.predict import predict_scene
 from raytran.run.predict.room import RoomViews
 from raytran.run.predict.write_scene import write_scene
@@ -38,6 +40,7 @@ from raytran.training.datamodule import SceneDataModule
 _log = logging.getLogger(__name__)
 
 _RECORD = "demo.json"
+_LOCK = ".demo.lock"
 _RECORDED = ("preset", "seed", "model", "loss", "optimizer", "views", "rooms", "schedule")
 """Settings that a demo must share with the one it continues."""
 
@@ -93,6 +96,16 @@ def demo(cfg: DictConfig) -> DemoResult:
         ConfigError: the folder holds a demo with other settings.
     """
     output = Path(cfg.output).resolve()
+
+    def taken(who: str) -> ConfigError:
+        return ConfigError(f"another process makes the demo in {output} ({who}): wait, or give output=")
+
+    with exclusive_lock(output / _LOCK, if_taken=taken):
+        return _demo(cfg, output)
+
+
+def _demo(cfg: DictConfig, output: Path) -> DemoResult:
+    """Make the demo in a folder that nobody else writes."""
     overrides = [f"preset={cfg.preset}", f"data.root={quoted(output / 'rooms')}", *plain(cfg.overrides)]
     data = _data(overrides, output)
     times = StepTimes(output / "times.json")

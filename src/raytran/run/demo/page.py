@@ -12,6 +12,7 @@ from typing import Any
 from PIL import Image
 
 from raytran.checkpoints.metadata import provenance
+from raytran.data.images import decode_image
 from raytran.pictures.curves import draw_curves
 from raytran.pictures.page import data_uri
 from raytran.pictures.page import write_page as fill_template
@@ -157,7 +158,11 @@ def _room(scene: ShownScene, pictures: Path) -> dict[str, Any]:
     folder = pictures / scene.column
     folder.mkdir(parents=True, exist_ok=True)
     in_order = dict.fromkeys(scene.folder / "overlays" / f"{name}.jpg" for name in batch.frame_id[0])
-    overlays = [Image.open(path) for path in in_order if path.is_file()]
+    overlays = [
+        Image.fromarray(decode_image(path, name=str(path)).permute(1, 2, 0).numpy())
+        for path in in_order
+        if path.is_file()
+    ]
     shown = [
         _picture(
             scene.folder / "topdown.png", "From above. Filled: predicted; dashed: true; arrow heads: fronts."

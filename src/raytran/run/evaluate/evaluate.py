@@ -26,10 +26,10 @@ from raytran.geometry.camera import Cameras
 from raytran.model import RayTran
 from raytran.postprocess import DUPLICATE_IOU, SCORE_THRESHOLD
 from raytran.run.device import choose_device, set_matmul_precision
-from raytran.run.entry import compose
+from raytran.run.entry import compose, typed_settings
 from raytran.run.evaluate.results import MARKER, Evaluation, read_curves, result_tables, write_evaluation
 from raytran.run.evaluate.score import ProtocolScores, confidence, evaluate_predictions
-from raytran.run.output import check_replaceable
+from raytran.run.output import one_writer
 from raytran.run.train.build import build_data
 from raytran.structs import SceneBatch
 from raytran.training.datamodule import SceneDataModule
@@ -61,9 +61,9 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
         raise ConfigError(f"num_resamples={cfg.num_resamples} is too few, give at least 1")
     other_curves = read_curves(cfg.draw_with)
     output = Path(cfg.output)
-    check_replaceable(output.resolve(), marker=MARKER)
-    evaluation, title = _of_files(cfg) if cfg.checkpoint is None else _of_checkpoint(cfg)
-    files = write_evaluation(output, evaluation, other_curves=other_curves)
+    with one_writer(output, marker=MARKER):
+        evaluation, title = _of_files(cfg) if cfg.checkpoint is None else _of_checkpoint(cfg)
+        files = write_evaluation(output, evaluation, other_curves=other_curves)
     console = Console()
     for table in result_tables(evaluation, title=title):
         console.print(table)
@@ -122,7 +122,7 @@ def _overrides_of_checkpoint(
     cfg: DictConfig, settings: PredictionSettings, model: RayTran, tasks: Collection[str]
 ) -> list[str]:
     """Return what was typed and, as if typed too, the preset and the data that a checkpoint wants."""
-    typed = list(HydraConfig.get().overrides.task)
+    typed = typed_settings(HydraConfig.get())
     preset = [] if any(item.startswith("preset=") for item in typed) else [f"preset={settings.preset}"]
     wanted: dict[str, Any] = {
         "views.image_size": list(settings.image_size),

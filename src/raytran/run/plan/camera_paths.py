@@ -44,4 +44,4 @@ def recorded(scan: Path, views: int) -> Cameras:
     """
     found = read_scan(scan)
     chosen = choose_even(len(found), views)
-    return Cameras(found.intrinsics.expand(views, 3, 3), found.world_from_camera[chosen], found.image_size)
+    return found.cameras[chosen]

@@ -77,10 +77,9 @@ def render_views(
             indices = (owner == volume).nonzero().squeeze(1).tolist()  # of the cameras that see this volume
             if not indices:
                 continue
-            intrinsics, poses = cameras.intrinsics[indices][None], cameras.world_from_camera[indices][None]
             images = model.render(
                 room.views_of(volume).to(device),
-                Cameras(intrinsics.to(device), poses.to(device), cameras.image_size),
+                cameras[indices][None].to(device),
                 views_at_once=views_at_once,
                 grid_center=center.float().to(device),
             )

@@ -11,8 +11,9 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from raytran.capture.open import open_scene
+from raytran.capture.open import open_scene, parse_intrinsics
 from raytran.capture.orientation import WorldSettings
+from raytran.capture.recording import Intrinsics
 from raytran.checkpoints.load import PredictionSettings, load_model, prediction_settings
 from raytran.checkpoints.network import trusted_packages
 from raytran.data.shapenet.models import shapenet_version
@@ -20,7 +21,7 @@ from raytran.errors import ConfigError
 from raytran.model import RayTran
 from raytran.postprocess import count_object_views, merge_volumes, object_meshes, select_objects
 from raytran.run.device import choose_device, set_matmul_precision
-from raytran.run.output import check_replaceable
+from raytran.run.output import one_writer
 from raytran.run.predict.new_views import cameras_to_render, render_views
 from raytran.run.predict.room import RoomViews, check_choice, read_room
 from raytran.run.predict.write_scene import MARKER, PredictedScene, check_pictures, write_scene
@@ -63,9 +64,17 @@ def predict(cfg: DictConfig) -> Path:
     """
     recording, output = Path(cfg.scene).resolve(), Path(cfg.output)
     world = WorldSettings(up=cfg.up, scale=cfg.scale, convention=cfg.convention, check=cfg.check)
+    intrinsics = parse_intrinsics(cfg.get("intrinsics"))
     check_choice(cfg.frames, cfg.num_views)
     check_pictures(num_overlays=cfg.num_overlays, turntable=cfg.turntable)
-    check_replaceable(output.resolve(), marker=MARKER)
+    with one_writer(output, marker=MARKER):
+        return _predict(cfg, recording, output, world, intrinsics)
+
+
+def _predict(
+    cfg: DictConfig, recording: Path, output: Path, world: WorldSettings, intrinsics: Intrinsics | None
+) -> Path:
+    """Predict with settings that were checked, into a folder that nobody else writes."""
     if cfg.cads:
         shapenet_version(Path(cfg.cads))  # It raises where there are none, before the network runs.
     settings = prediction_settings(cfg.checkpoint)
@@ -79,7 +88,7 @@ def predict(cfg: DictConfig) -> Path:
     new_cameras = cameras_to_render(cfg.views, model, cfg.checkpoint)
     scene_id = recording.stem if recording.is_file() else recording.name
     truth = read_truth(Path(cfg.truth), scene_id) if cfg.truth else None
-    room = _read_room(cfg, world, settings, model)
+    room = _read_room(cfg, world, intrinsics, settings, model)
     scene = predict_scene(
         model,
         room,
@@ -192,10 +201,15 @@ def predict_room(
 
 
 def _read_room(
-    cfg: DictConfig, world: WorldSettings, settings: PredictionSettings, model: RayTran
+    cfg: DictConfig,
+    world: WorldSettings,
+    intrinsics: Intrinsics | None,
+    settings: PredictionSettings,
+    model: RayTran,
 ) -> RoomViews:
     """Return the frames that the network is given, and its volumes."""
-    with open_scene(Path(cfg.scene).resolve(), format=cfg.format, settings=world) as scan:
+    scene = Path(cfg.scene).resolve()
+    with open_scene(scene, format=cfg.format, settings=world, intrinsics=intrinsics) as scan:
         return read_room(
             scan,
             frames=cfg.frames,

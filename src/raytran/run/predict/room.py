@@ -94,14 +94,13 @@ def read_room(
             cannot be metres.
     """
     report_dropped(scan)
-    poses = scan.world_from_camera
-    cameras = Cameras(scan.intrinsics.expand(len(scan), 3, 3), poses, scan.image_size)
+    cameras = scan.cameras
     volumes, looks_into = cover(cameras, resolution=resolution, extent=extent, name=scan.scene_id)
     choose = _choose_by_coverage if frames == "coverage" else _choose_evenly
     chosen = choose(scan, cameras, volumes, looks_into, num_views)
     if len(volumes) == 1:
         # On the cameras that are used, as in training.
-        volumes, _ = cover(_select_cameras(cameras, chosen[0]), resolution=resolution, extent=extent)
+        volumes, _ = cover(cameras[list(chosen[0])], resolution=resolution, extent=extent)
     else:
         _log.info(
             "%s is larger than the volume of %s m: predicted in %d that overlap, from %s frames",
@@ -169,7 +168,7 @@ def _choose_by_coverage(
     for center, looks_inside in zip(volumes.center, looks_into, strict=True):
         sharp = candidates[~blurred & looks_inside[candidates]]
         grid = VoxelGrid(volumes.resolution, volumes.extent, center)
-        choice = choose_by_coverage(_select_cameras(cameras, sharp.tolist()), grid, num_views)
+        choice = choose_by_coverage(cameras[sharp], grid, num_views)
         if len(choice.frames) < min(MIN_VIEWS, num_views):
             # The camera stands still: all frames are near-duplicates of each other, and must do.
             chosen.append(_spread(looks_inside.nonzero().squeeze(1), num_views))
@@ -192,8 +191,3 @@ def _choose_by_coverage(
 def _spread(frames: Tensor, count: int) -> tuple[int, ...]:
     """Return up to ``count`` of some frames, spread evenly."""
     return tuple(dict.fromkeys(frames[choose_even(len(frames), count)].tolist()))
-
-
-def _select_cameras(cameras: Cameras, frames: Sequence[int]) -> Cameras:
-    index = list(frames)
-    return Cameras(cameras.intrinsics[index], cameras.world_from_camera[index], cameras.image_size)

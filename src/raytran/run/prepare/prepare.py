@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -57,6 +58,11 @@ def prepare(cfg: DictConfig) -> Any:
     return _prepare_cads(settings, output)
 
 
+def _data_root(folder: Path) -> str:
+    """Return the setting of a command that reads a data set, as one types it into a shell."""
+    return shlex.quote(f"data.root={folder}")
+
+
 def _prepare_rooms(settings: dict[str, Any], output: Path) -> Any:
     _refuse(settings, "num_test", because="dataset=rooms has no test rooms, dataset=rooms-v1 has")
     settings = _with_preset(settings)
@@ -66,7 +72,7 @@ def _prepare_rooms(settings: dict[str, Any], output: Path) -> Any:
         processes=settings["processes"],
         **{name: settings[name] for name in ("num_train", "num_val", *_FREE_ONLY)},
     )
-    _log.info("rooms are in %s; train on them with data.root=%s", output.resolve(), output)
+    _log.info("rooms are in %s; train on them with %s", output.resolve(), _data_root(output))
     return report
 
 
@@ -75,7 +81,7 @@ def _prepare_rooms_v1(settings: dict[str, Any], output: Path) -> Any:
     _refuse(settings, "cads", because="given CAD models go with dataset=rooms-v1-furniture")
     report = generate_rooms_v1(output, processes=settings["processes"], **_given(settings, *_COUNTS))
     _log.info("%s\nthe rooms are in %s", report_on_rooms(report.root), report.root)
-    _log.info("train on them with data=rooms-v1 data.root=%s, then evaluate … split=test", output)
+    _log.info("train on them with data=rooms-v1 %s, then evaluate … split=test", _data_root(output))
     return report
 
 
@@ -89,7 +95,7 @@ def _prepare_rooms_v1_furniture(settings: dict[str, Any], output: Path) -> Any:
         output, cads=Path(settings["cads"]), processes=settings["processes"], **numbers
     )
     _log.info("%s\nthe rooms are in %s; evaluate on them with", report_on_rooms(report.root), report.root)
-    _log.info("python -m raytran.evaluate checkpoint=CKPT data=scan2cad data.root=%s split=test", output)
+    _log.info("python -m raytran.evaluate checkpoint=CKPT data=scan2cad %s split=test", _data_root(output))
     return report
 
 
@@ -112,7 +118,7 @@ def _prepare_scan2cad(settings: dict[str, Any], output: Path) -> Any:
         processes=settings["processes"],
     )
     _log.info("\n%s\nthe scans are in %s; train on them with", prepared.text, prepared.root)
-    _log.info("python -m raytran.train data=scan2cad data.root=%s", output)
+    _log.info("python -m raytran.train data=scan2cad %s", _data_root(output))
     return prepared
 
 

@@ -27,7 +27,8 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from raytran.checkpoints.runs import one_at_a_time, read_finished
 from raytran.data.files import write_text
 from raytran.errors import ConfigError, RaytranError
-from raytran.run.entry import quoted, typed_config_dir, user_environment
+from raytran.run.entry import typed_config_dir, typed_settings, user_environment
+from raytran.run.path_settings import quoted
 from raytran.run.sweep.folder import RECORD, THIS_SWEEP, last_value, own_settings, read_record, write_record
 from raytran.training.callbacks.stop_signals import forward_signals
 
@@ -154,7 +155,7 @@ def _jobs(
         if number == len(recorded):
             recorded.append({"overrides": settings, "folder": str(composed.hydra.sweep.subdir)})
         jobs.append(Job(number, tuple(overrides), folder / recorded[number]["folder"], composed))
-    typed = [str(item) for item in config.hydra.overrides.task]
+    typed = typed_settings(config.hydra)
     write_record(folder, config.hydra.job.config_name, typed, recorded)
     shared = set.intersection(*(set(job["overrides"]) for job in recorded)) if len(recorded) > 1 else set()
     for job in jobs:

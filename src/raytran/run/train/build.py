@@ -16,6 +16,7 @@ from raytran.checkpoints.file import BEST_NAME
 from raytran.checkpoints.network import without_sources
 from raytran.checkpoints.runs import LAST
 from raytran.errors import ConfigError
+from raytran.run.path_settings import without_references
 from raytran.run.train.settings import RunConfig
 from raytran.training.callbacks.health import Health
 from raytran.training.callbacks.last_checkpoint import BestCheckpoint, LastCheckpoint
@@ -42,6 +43,16 @@ def plain(node: Any) -> Any:
     return OmegaConf.to_container(node, resolve=True)
 
 
+def _literal(node: Any) -> Any:
+    """Return plain Python whose texts ``instantiate`` hands on as they are, with ``${`` in them too."""
+    if isinstance(node, dict):
+        return {key: _literal(value) for key, value in node.items()}
+    if isinstance(node, list):
+        return [_literal(value) for value in node]
+    # Hydra has OmegaConf read every text twice.
+    return without_references(without_references(node)) if isinstance(node, str) else node
+
+
 def build_model(cfg: DictConfig, *, pretrained: bool = True) -> RayTran:
     """Return the network.
 
@@ -50,7 +61,7 @@ def build_model(cfg: DictConfig, *, pretrained: bool = True) -> RayTran:
         pretrained: False leaves out the image encoder's own weights, because a checkpoint will fill it.
     """
     config = plain(cfg.model)
-    return instantiate(config if pretrained else without_sources(config), _convert_="all")
+    return instantiate(_literal(config if pretrained else without_sources(config)), _convert_="all")
 
 
 def build_module(cfg: DictConfig, model: RayTran) -> Reconstruction:
@@ -67,7 +78,7 @@ def build_module(cfg: DictConfig, model: RayTran) -> Reconstruction:
 
 def build_data(cfg: DictConfig) -> SceneDataModule:
     """Return the data module."""
-    return instantiate(cfg.data, _convert_="all")
+    return instantiate(_literal(plain(cfg.data)), _convert_="all")
 
 
 def choose_precision(precision: str, *, on_cpu: bool) -> str:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import subprocess
 import sys
@@ -13,10 +14,12 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from raytran.checkpoints.runs import LAST, read_finished, write_finished
+from raytran.checkpoints.runs import LAST, one_at_a_time, read_finished, write_finished
 from raytran.data.files import SettingsRecord
+from raytran.data.workers import ENDS_WITH
 from raytran.errors import ConfigError, RaytranError
-from raytran.run.entry import compose, quoted, typed_config_dir, user_environment
+from raytran.run.entry import compose, typed_config_dir, typed_settings, user_environment
+from raytran.run.path_settings import quoted
 from raytran.run.train.fit import FitResult, train
 from raytran.training.callbacks.stop_signals import forward_signals
 
@@ -30,7 +33,7 @@ _OWN = ("stages", "output_dir", "resume")
 def curriculum(cfg: DictConfig) -> list[FitResult]:
     """Run ``python -m raytran.curriculum``: the overrides typed there hold for every stage."""
     overrides = [
-        item for item in HydraConfig.get().overrides.task if item.split("=")[0].lstrip("+~") not in _OWN
+        item for item in typed_settings(HydraConfig.get()) if item.split("=")[0].lstrip("+~") not in _OWN
     ]
     return run_curriculum(overrides, output_dir=Path(cfg.output_dir), stages=tuple(cfg.stages))
 
@@ -57,7 +60,15 @@ def run_curriculum(
     presets = [
         compose("train", [*overrides, f"experiment={name}", "output_dir=none"]).preset for name in stages
     ]
-    _record(output_dir, overrides, stages)
+    with one_at_a_time(output_dir):
+        _record(output_dir, overrides, stages)
+        return _train_stages(overrides, output_dir, stages, presets)
+
+
+def _train_stages(
+    overrides: Sequence[str], output_dir: Path, stages: Sequence[str], presets: Sequence[str]
+) -> list[FitResult]:
+    """Train the stages that have not finished."""
     results: list[FitResult] = []
     for number, experiment in enumerate(stages, start=1):
         _log.info("stage %d of %d: experiment=%s", number, len(stages), experiment)
@@ -103,7 +114,7 @@ def _config_dir() -> list[str]:
 def _run(command: Sequence[str]) -> int:
     """Run a command and return its exit code; forward signals to it, and stop after it if one came."""
     stopped_by = 0
-    with subprocess.Popen(command, env=user_environment()) as process:
+    with subprocess.Popen(command, env=user_environment() | {ENDS_WITH: str(os.getpid())}) as process:
 
         def stop(signum: int) -> None:
             nonlocal stopped_by

@@ -15,17 +15,20 @@ import lightning.pytorch as pl
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from raytran.checkpoints.file import read_checkpoint, read_newest
 from raytran.checkpoints.load import load_weights
 from raytran.checkpoints.metadata import DataIdentity, checkpoint_metadata, provenance
-from raytran.checkpoints.runs import LAST, one_at_a_time, read_finished, write_finished
+from raytran.checkpoints.runs import FINISHED, LAST, one_at_a_time, read_finished, write_finished
 from raytran.data.files import write_json, write_text
 from raytran.errors import CheckpointError, ConfigError
 from raytran.run.device import cudnn_warning, set_matmul_precision
 from raytran.run.train.build import build_data, build_model, build_module, build_trainer, plain
 from raytran.run.train.memory import explained_out_of_memory
 from raytran.run.train.parent import find_parent, stages_after
+from raytran.run.train.rank_processes import rank_processes
 from raytran.run.train.settings import RunConfig
 from raytran.run.train.start_report import changed_settings, start_report
 from raytran.training.callbacks.stage import StageCallback
@@ -37,6 +40,9 @@ if TYPE_CHECKING:
     from raytran.model import RayTran
 
 _log = logging.getLogger(__name__)
+
+CONFIG = "config.yaml"
+"""File with all settings of a run, in its folder."""
 
 RANDOM_ENCODER = (
     "IMAGE ENCODER STARTS FROM RANDOM WEIGHTS: model.backbone.encoder.weights=auto found no ImageNet weights"
@@ -77,7 +83,7 @@ def train(cfg: DictConfig) -> FitResult:
     run = RunConfig.read(cfg)
     folder = Path(run.output_dir)
     with one_at_a_time(folder) if _is_first_rank() else nullcontext():
-        return _finished_before(run, folder) or _train(cfg, run, folder)
+        return _finished_before(run, folder, steps=cfg.trainer.max_steps) or _train(cfg, run, folder)
 
 
 def _train(cfg: DictConfig, run: RunConfig, folder: Path) -> FitResult:
@@ -108,7 +114,7 @@ def _train(cfg: DictConfig, run: RunConfig, folder: Path) -> FitResult:
         _log.warning("%s", warning)
     began = time.monotonic()
     try:
-        with explained_out_of_memory(cfg):
+        with explained_out_of_memory(cfg), rank_processes(trainer):
             trainer.fit(module, data, ckpt_path=start.resume_from)
     except StopRequestedError as stop:
         # One rank tells the shell; Lightning and torchrun would take codes of the others for a crash.
@@ -131,8 +137,18 @@ def _train(cfg: DictConfig, run: RunConfig, folder: Path) -> FitResult:
     return FitResult(folder, folder / LAST, trainer.global_step, seconds, metrics)
 
 
-def _finished_before(run: RunConfig, folder: Path) -> FitResult | None:
-    """Return the result of a run that needs nothing more, None if there is work to do."""
+def _finished_before(run: RunConfig, folder: Path, *, steps: int) -> FitResult | None:
+    """Return the result of a run that needs nothing more, None if there is work to do.
+
+    A run that has taken all the steps it was given goes on if it is given more; it then is unfinished again.
+
+    Args:
+        run: the switches of the run.
+        folder: of the run.
+        steps: how many it is to take in all, as of Lightning's ``max_steps``.
+    """
+    # In this order: the first of torchrun's ranks removes the mark before it writes down its own settings.
+    given = _given_steps(folder)
     finished = read_finished(folder)
     if run.resume == "none":
         if finished is not None or (folder / LAST).is_file():
@@ -142,8 +158,26 @@ def _finished_before(run: RunConfig, folder: Path) -> FitResult | None:
         return None
     if finished is None:
         return None
+    before = given or finished.steps
+    if before >= 0 and not 0 <= steps <= before:
+        _log.info("%s has finished with %d steps and goes on", folder, finished.steps)
+        if _is_first_rank():
+            (folder / FINISHED).unlink(missing_ok=True)
+        return None
     _log.info("%s has finished already (%s, %d steps)", folder, finished.stage, finished.steps)
     return FitResult(folder, folder / finished.checkpoint, finished.steps, 0.0, {})
+
+
+def _given_steps(folder: Path) -> int | None:
+    """Return how many steps the run in ``folder`` was to take, below 0 for no end, None if it does not say.
+
+    It may have finished with fewer, where its scores got no better.
+    """
+    try:
+        steps = OmegaConf.select(OmegaConf.load(folder / CONFIG), "trainer.max_steps")
+    except (OSError, ValueError, YAMLError, OmegaConfBaseException):
+        return None
+    return steps if isinstance(steps, int) else None
 
 
 class _Start(NamedTuple):
@@ -227,7 +261,7 @@ def _stage(cfg: DictConfig) -> Stage:
 
 def _describe_run(cfg: DictConfig, folder: Path) -> None:
     """Write the resolved config and where the code comes from beside the results."""
-    write_text(folder / "config.yaml", OmegaConf.to_yaml(cfg, resolve=True))
+    write_text(folder / CONFIG, OmegaConf.to_yaml(cfg, resolve=True))
     write_json(folder / "provenance.json", provenance())
 
 

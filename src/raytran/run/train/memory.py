@@ -12,13 +12,13 @@ from omegaconf import DictConfig, OmegaConf
 from raytran.errors import ConfigError
 
 _SAVING = {
-    "views.batch_size": "fewer scenes at once; trainer.accumulate_grad_batches makes up for it",
-    "views.num_views": "fewer frames a scene",
-    "trainer.precision": "bf16-mixed halves what is kept for the backward pass",
-    "model.backbone.checkpoint_blocks": "true computes the blocks twice instead of keeping them",
-    "views.image_size": "smaller images",
+    "views.batch_size": "fewer",
+    "views.num_views": "fewer",
+    "trainer.precision": "bf16-mixed",
+    "model.backbone.checkpoint_blocks": "true",
+    "views.image_size": "smaller",
 }
-"""What changing each setting does, in order: those that change the result least come first."""
+"""What each setting may become (docs/out-of-memory.md); those that change the result least come first."""
 
 
 @contextmanager

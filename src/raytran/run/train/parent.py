@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,11 @@ from raytran.errors import ConfigError
 from raytran.run.config_dir import config_dir
 from raytran.run.train.settings import RunConfig
 from raytran.training.stage import Stage
+
+_log = logging.getLogger(__name__)
+
+_MOST_NAMED = 5
+"""Runs that are named of those that will not do."""
 
 
 def find_parent(run: RunConfig, stage: Stage, data: DataIdentity) -> tuple[Path, dict[str, Any]] | None:
@@ -46,24 +52,19 @@ def find_parent(run: RunConfig, stage: Stage, data: DataIdentity) -> tuple[Path,
         if known is None or known.is_same(data):
             return path, read_checkpoint(path) if content is None else content
         others.append(f"{path} on {known}")
-    raise ConfigError(_no_parent(run, stage, data, others))
+    for other in others[:_MOST_NAMED]:
+        _log.warning("there is %s", other)
+    raise ConfigError(_no_parent(run, stage, data, number_of_others=len(others)))
 
 
-def _no_parent(run: RunConfig, stage: Stage, data: DataIdentity, others: list[str]) -> str:
+def _no_parent(run: RunConfig, stage: Stage, data: DataIdentity, *, number_of_others: int) -> str:
+    runs = f"no finished run of {stage.parent} with preset {run.preset} in outputs={run.outputs}"
     first = f"`python -m raytran.train experiment={stage.parent_experiment} preset={run.preset}"
-    where = f"under {Path(run.outputs).resolve()}"
-    if not others:
-        return (
-            f"no finished run of {stage.parent} with preset {run.preset} {where}: run {first}` first, "
-            "or give init_from=CHECKPOINT, or init_from=none to start from scratch"
-        )
-    more = f" and {len(others) - 1} more" if len(others) > 1 else ""
-    return (
-        f"no finished run of {stage.parent} with preset {run.preset} {where} "
-        f"was trained on {data}, only on other data ({others[0]}{more}): run {first} {data.typed()}` first, "
-        "or give init_from=CHECKPOINT to start from other data all the same, or init_from=none to start "
-        "from scratch"
-    )
+    otherwise = "or give init_from=CHECKPOINT, or init_from=none to start from scratch"
+    if not number_of_others:
+        return f"{runs}: run {first}` first, {otherwise}"
+    others, first = f"{number_of_others} on others", f"{first} {data.typed()}"
+    return f"{runs} is on these data, {others}: run {first}` first, {otherwise}"
 
 
 def stages_after(stage: Stage) -> list[Stage]:

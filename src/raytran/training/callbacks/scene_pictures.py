@@ -3,20 +3,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import shutil
 from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
-import numpy as np
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
-from PIL import Image
 from scipy.spatial import QhullError
 
 from raytran.data.collate import collate_scenes
 from raytran.data.files import disk_full, finished_folder
+from raytran.data.images import decode_image
 from raytran.data.views import choose_even
 from raytran.model import inputs_of
 from raytran.pictures.scene_pictures import draw_scene
@@ -66,7 +66,8 @@ class ScenePictures(pl.Callback):
         logged_at = step - 1  # where Lightning, which counts logged steps from 0, puts the scores
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
-                _log_tensorboard(logger, pictures, logged_at)
+                with contextlib.suppress(OSError):  # the logger says so
+                    _log_tensorboard(logger, pictures, logged_at)
             elif isinstance(logger, WandbLogger):
                 _log_wandb(logger, pictures, found, logged_at, grid_extent)
 
@@ -108,7 +109,7 @@ class ScenePictures(pl.Callback):
 
 def _log_tensorboard(logger: TensorBoardLogger, pictures: dict[str, Path], step: int) -> None:
     for name, path in pictures.items():
-        image = np.asarray(Image.open(path).convert("RGB"))
+        image = decode_image(path, name=str(path)).permute(1, 2, 0).numpy()
         logger.experiment.add_image(f"pictures/{name}", image, step, dataformats="HWC")
     logger.experiment.flush()
 
