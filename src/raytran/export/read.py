@@ -392,8 +392,8 @@ def read_alignments_csv(path: Path) -> CadAlignments:
     short = [row for row in rows if len(row.names[0]) != _CATID_DIGITS]
     if short:
         _log.warning(
-            "%s, line %d: catid_cad %r does not have eight digits (%d such lines) and matches nothing",
-            *(path, short[0].line, short[0].names[0], len(short)),
+            "%s, line %d: catid_cad %s does not have eight digits (%d such lines) and matches nothing",
+            *(path, short[0].line, shown(short[0].names[0]), len(short)),
         )
     return _alignments_from_rows(rows)
 

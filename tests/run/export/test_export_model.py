@@ -143,7 +143,7 @@ def test_a_file_cannot_run_foreign_code(trained, tmp_path):
 def test_the_file_and_not_its_claim_decides_how_much_memory_is_taken(trained, tmp_path):
     """A network of a terabyte is described: it is refused before memory for it is asked for."""
     content = torch.load(trained.path, weights_only=True)
-    shape = content["model"]["heads"]["shape"] | {"widths": [1 << 17, 1 << 16, 64, 32]}
+    shape = content["model"]["heads"]["shape"] | {"widths": [1 << 16, 1 << 15, 64, 32]}
     put(tmp_path / "huge.safetensors", content, heads=content["model"]["heads"] | {"shape": shape})
     with pytest.raises(CheckpointError, match=r"\(preset tiny\) do not fit"):
         raytran.load(tmp_path / "huge.safetensors")
