@@ -373,7 +373,7 @@ def test_damage_to_one_frame_leaves_that_one_out(walk):
     images.write_text("\n".join(rows))
     scan = open_recording(read_colmap(walk.folder))
     assert scan.dropped == {
-        "2": "impossible intrinsics",
+        "2": "focal lengths and centre not positive and finite",
         "4": "impossible intrinsics",
         "7": "no pose",
         f"line {at + 1}": "entry is damaged",

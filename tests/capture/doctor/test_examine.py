@@ -133,8 +133,8 @@ def test_damaged_and_lost_frames_are_counted(copy):
 
 def test_a_missing_part_is_one_fault_with_the_readers_words(copy):
     folder = copy / "scannet" / "scans" / SCAN
-    for path in (folder / "intrinsic").iterdir():
-        path.unlink()
+    for path in (*(folder / "intrinsic").iterdir(), folder / f"{SCAN}.txt"):
+        path.unlink()  # the header would fill in for the intrinsics
     result = diagnose(copy, annotation=None)
     assert [finding.cause for finding in result.faults] == ["cannot be read"]
     assert "intrinsic_color.txt is missing" in result.faults[0].text
