@@ -384,7 +384,7 @@ def test_the_depth_cameras_intrinsics_are_not_taken(write_scan) -> None:
     assert read_scan(folder, intrinsics=(40, 41, 24, 16)).intrinsics.reshape(-1, 3, 3)[0, 1, 1] == 41
 
 
-def test_the_header_fills_in_intrinsics_and_does_not_replace_them(write_scan, caplog) -> None:
+def test_the_header_is_held_against_the_intrinsics_and_does_not_replace_them(write_scan, caplog) -> None:
     folder = write_scan()
     path = folder / "intrinsic" / "intrinsic_color.txt"
     header = "colorWidth = 48\ncolorHeight = 32\nfx_color = {}\nfy_color = 40\nmx_color = 24\nmy_color = 16\n"
@@ -392,8 +392,6 @@ def test_the_header_fills_in_intrinsics_and_does_not_replace_them(write_scan, ca
     assert read_scan(folder).intrinsics.reshape(-1, 3, 3)[0, 0, 0] == 40
     assert "differ by 1.7 % in the intrinsics of the colour camera: the former are taken" in caplog.text
     path.unlink()
-    assert read_scan(folder).intrinsics.reshape(-1, 3, 3)[0, 0, 0] == 40.7
-    (folder / "scene0000_00.txt").write_text(header.format("wide"))
     with pytest.raises(DataError, match=r"intrinsic_color\.txt is missing: .*or give intrinsics=fx,fy,cx,cy"):
         read_scan(folder)
 

@@ -260,7 +260,7 @@ def _intrinsics(
 ) -> tuple[NDArray[np.float64], Path]:
     """Return the 4×4 camera matrix of a folder, and where it was read.
 
-    What the user typed comes first, then the file of intrinsics, then ``<scan>.txt``.
+    What the user typed comes first, then the file of intrinsics; ``<scan>.txt`` is only held against it.
 
     Raises:
         DataError: there is none, or it is damaged.
@@ -269,9 +269,6 @@ def _intrinsics(
         return camera_matrix(*typed), Path("intrinsics=" + ",".join(f"{value:g}" for value in typed))
     path = layout.intrinsics()
     stated = header_intrinsics(facts)
-    if not path.is_file() and stated is not None:
-        _log.info("%s has no file of intrinsics: those of %s are taken", layout.scan, header.name)
-        return stated, header
     depth = layout.depth_intrinsics()
     if not path.is_file() and depth is not None:
         raise DataError(
