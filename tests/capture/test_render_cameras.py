@@ -93,6 +93,7 @@ def test_nerfstudios_list_comes_in_opencv_axes(write):
         ({**SHARED, "views": [{"world_from_camera": [[1, 2], [3, 4]]}]}, "does not hold 4x4 numbers"),
         ({**SHARED, "views": [{"world_from_camera": np.zeros((4, 4)).tolist()}]}, "no rotation and place"),
         ({**SHARED, "views": [VIEW, {**VIEW, "name": "DOOR"}]}, r"has the name of views\[0\]"),
+        ({**SHARED, "image_size": [10**400, 64], "views": [VIEW]}, "has no image_size"),
         ({**SHARED, "views": [{**VIEW, "name": "../door"}]}, "no file name"),
         ({**SHARED, "views": [{**VIEW, "name": ".."}]}, "no file name"),
         ({**SHARED, "views": [{**VIEW, "name": 7}]}, "no file name"),

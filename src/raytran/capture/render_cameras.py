@@ -93,7 +93,7 @@ def read_render_cameras(path: Path) -> RenderCameras:
 def _lens(entry: Mapping[str, Any], where: str) -> Lens:
     try:
         height, width = (int(side) for side in entry["image_size"])
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DataError(f"{where} has no image_size: write [height, width] in pixels") from error
     try:
         given = np.array(entry["intrinsics"], dtype=np.float64)
