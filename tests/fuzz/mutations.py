@@ -148,12 +148,17 @@ def json_text(value: Any, rng: random.Random | None = None) -> str:
     return text
 
 
-def with_raw_values(value: Any) -> Any:
-    """Return a value with Python's own in place of stand-ins."""
+_DEEPEST = 200
+
+
+def with_raw_values(value: Any, depth: int = 0) -> Any:
+    """Return a value with Python's own in place of stand-ins, as deep as the mutations of one input reach."""
+    if depth > _DEEPEST:
+        return value
     if isinstance(value, dict):
-        return {key: with_raw_values(part) for key, part in value.items()}
+        return {key: with_raw_values(part, depth + 1) for key, part in value.items()}
     if isinstance(value, list):
-        return [with_raw_values(part) for part in value]
+        return [with_raw_values(part, depth + 1) for part in value]
     if not isinstance(value, str) or value not in RAW:
         return value
     deep: list[Any] = []
