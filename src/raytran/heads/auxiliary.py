@@ -55,7 +55,9 @@ def check_widths(widths: Sequence[int], groups: int) -> None:
         ConfigError: a width is not, or there is none.
     """
     if not widths or any(width % groups for width in widths):
-        raise ConfigError(f"widths of a head are {list(widths)}: give one or more, each divisible by {groups}")
+        raise ConfigError(
+            f"widths of a head are {list(widths)}: give one or more, each divisible by {groups}"
+        )
 
 
 def image_upsampler(channels: int, widths: Sequence[int], outputs: int) -> nn.Sequential:
