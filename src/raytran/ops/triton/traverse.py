@@ -60,13 +60,13 @@ def trace_blocks(
     voxels = Tiling.of_voxels(scenes * grid.num_voxels, (scenes, *grid.resolution))
     slope = direction.reciprocal().masked_fill_(direction == 0, 0.0)
     tile = torch.arange(pixels.num_tiles, device=origin.device)
-    rays = (origin.contiguous(), slope.contiguous()), pixels.start(tile).int()
+    rays = (origin.contiguous(), slope.contiguous(), slope.float().contiguous()), pixels.start(tile).int()
     with torch.cuda.device_of(origin):
         return _trace(rays, pixels, voxels, rays_per_cell**2, capacity)
 
 
 def _trace(
-    rays: tuple[tuple[Tensor, Tensor], Tensor],
+    rays: tuple[tuple[Tensor, Tensor, Tensor], Tensor],
     pixels: Tiling,
     voxels: Tiling,
     rays_per_pixel: int,
