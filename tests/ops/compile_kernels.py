@@ -89,7 +89,7 @@ def resources(compiled: Any) -> dict[str, int]:
 
 
 def instructions(compiled: Any) -> dict[str, int]:
-    """Return how many instructions a warp has in all, and how many in the longest loop: an inner step."""
+    """Return how many instructions a warp has in all, and in each loop; there also those of float64."""
     tool = Path(nvidia.__file__).parent / "bin" / "nvdisasm"
     with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
         file.write(compiled.asm["cubin"])
@@ -110,7 +110,8 @@ def instructions(compiled: Any) -> dict[str, int]:
                 jumps.append((count, target[1]))
     loops = [(places[label], at) for at, label in jumps if places.get(label, at) < at - 1]
     steps = [
-        {"step": at - start, "doubles": sum(start < place <= at for place in doubles)} for start, at in loops
+        {"instructions": at - start, "doubles": sum(start < place <= at for place in doubles)}
+        for start, at in loops
     ]
     return {"instructions": count, "steps": steps}
 

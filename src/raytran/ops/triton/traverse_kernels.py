@@ -3,14 +3,14 @@
 
 Every test is a slab test: a ray is between two planes over an interval of depth, inside a box over the
 intersection of three of them, and the box counts if that is longer than ``NUDGE`` (the rule of ``traverse``).
-The rule is float64's. Since GPUs for games and inference compute float64 at 1/64 of the speed, tests are first
-made in float32 with a bound of their error, and only where that leaves in doubt what counts are they made
-again: the result is that of float64 to the last bit. The interval of a block contains those of its voxels,
-because their planes are the same: no pair is lost by testing blocks first.
+The rule is float64's. Since many GPUs compute float64 at 1/64 of the speed, tests are made in float32 first,
+with a bound of their error, and again in float64 only where that leaves in doubt what counts: the result is
+that of float64 to the last bit. The interval of a block contains those of its voxels, because their planes
+are the same: no pair is lost by testing blocks first.
 
-``rays`` are origins ``(views, 3)`` in voxels and slopes ``(pixels · r, 3)``, depths per voxel along the axes, 0
-for a ray parallel to the axis' planes, r rays a pixel one after another; slopes again in float32. ``TILE`` and ``BLOCK`` are the (box, part,
-grid) of the tilings of pixels and voxels, see ``triton_attention``.
+``rays`` are origins ``(views, 3)`` in voxels and slopes ``(pixels · r, 3)``, depths per voxel along the axes,
+0 for a ray parallel to the axis' planes, r rays a pixel one after another; and the slopes in float32.
+``TILE`` and ``BLOCK`` are the (box, part, grid) of the tilings of pixels and voxels, see ``attention``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ import triton
 import triton.language as tl
 
 from raytran.ops.triton.attention_kernels import box_cells, box_inside, box_offsets
-
 
 NEVER = tl.constexpr(1e30)
 """Depth that no ray reaches."""
