@@ -78,6 +78,24 @@ def test_ranks_share_the_batch_norms_of_voxels_too(steps, tmp_path, command):
 
 
 @pytest.mark.slow
+def test_ranks_with_batch_norms_of_their_own_train_one_network(curriculum, steps, tmp_path, command):
+    """Two passes a step too: then the strategy may not take the graph for a static one."""
+    arguments = [*steps, "trainer=ddp_cpu", "experiment=stage1", "views.batch_size=1", "sync_norms=false"]
+    twice = ["trainer.accumulate_grad_batches=2", "trainer.max_steps=3", "output_dir=twice"]
+    for extra in (["output_dir=run"], twice):
+        done = command("train", *arguments, *extra, folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+    own, shared = (
+        torch.load(folder / LAST, weights_only=True)["state_dict"]
+        for folder in (tmp_path / "run", curriculum / "stage1")
+    )
+    name = "model.backbone.encoder.bn1.running_var"
+    assert own.keys() == shared.keys()
+    assert not torch.equal(own[name], shared[name])
+    torch.testing.assert_close(own[name], shared[name], rtol=0.2, atol=0.05)
+
+
+@pytest.mark.slow
 def test_torchruns_ranks_share_one_folder(steps, tmp_path):
     """Each is a command of its own, with a clock of its own."""
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -84,7 +85,35 @@ def resources(compiled: Any) -> dict[str, int]:
     (line,) = (line for line in text.splitlines() if "REG:" in line)
     usage = dict(word.split(":", 1) for word in line.split() if ":" in word)
     sizes = {name.lower(): int(usage[name]) for name in ("REG", "STACK", "LOCAL")}
-    return sizes | {"shared": compiled.metadata.shared}
+    return sizes | {"shared": compiled.metadata.shared} | instructions(compiled)
+
+
+def instructions(compiled: Any) -> dict[str, int]:
+    """Return how many instructions a warp has in all, and in each loop; there also those of float64."""
+    tool = Path(nvidia.__file__).parent / "bin" / "nvdisasm"
+    with tempfile.NamedTemporaryFile(suffix=".cubin") as file:
+        file.write(compiled.asm["cubin"])
+        file.flush()
+        text = subprocess.run([tool, "-c", file.name], capture_output=True, text=True, check=True).stdout
+    places: dict[str, int] = {}
+    jumps: list[tuple[int, str]] = []
+    doubles: list[int] = []
+    count = 0
+    for line in text.splitlines():
+        if label := re.match(r"(\.L_x_\d+):", line):
+            places[label[1]] = count
+        elif found := re.match(r"\s+/\*[0-9a-f]{4,}\*/\s+(?:@!?U?P\w+ )?(\w+)", line):
+            count += found[1] != "NOP"
+            if found[1] in ("DADD", "DMUL", "DFMA", "DSETP"):
+                doubles.append(count)
+            if target := re.search(r"BRA.*`\((\.L_x_\d+)\)", line):
+                jumps.append((count, target[1]))
+    loops = [(places[label], at) for at, label in jumps if places.get(label, at) < at - 1]
+    steps = [
+        {"instructions": at - start, "doubles": sum(start < place <= at for place in doubles)}
+        for start, at in loops
+    ]
+    return {"instructions": count, "steps": steps}
 
 
 def main() -> None:

@@ -24,6 +24,8 @@ SCRIPT = Path(__file__).with_name("compile_kernels.py")
 CAPABILITIES = (80, 89, 90, 100)  # A100, RTX 4090 and L40S, H100 and H200, B200
 PAPER = ("bfloat16:32:both", "float16:32", "float32:32")
 ATTENTION = ("attend_forward", "attend_backward_targets", "attend_backward_sources")
+MOST_INSTRUCTIONS = {"attend_forward": 1111, "attend_backward_targets": 1080, "attend_backward_sources": 1346}
+"""Instructions of all warps in an inner step, in 16 bits: 60 % of what four warps have, who do much twice."""
 MOST_SHARED = 99 * 1024  # bytes a program may have on an RTX 4090, the least of these GPUs
 MOST_STACK = 64  # bytes a thread; Triton 3.4 and 3.6 take up to 40 in float32 and for heads of 128
 
@@ -53,6 +55,11 @@ def test_paper_sizes_compile_once_for_any_number_of_views_and_spill_nothing(capa
         if kernel["kernel"] in ATTENTION and "float32" not in kernel["case"]:
             assert kernel["products"] > 0, kernel  # on tensor cores
             assert kernel["warps"] == 2, kernel  # more would do everything twice
+            longest = max(step["instructions"] for step in kernel["steps"])
+            assert longest * kernel["warps"] <= MOST_INSTRUCTIONS[kernel["kernel"]], kernel
+        if kernel["kernel"] in ("touch_blocks", "mask_blocks"):
+            first, again = kernel["steps"]  # in float32, and where that leaves a doubt in float64
+            assert first["doubles"] == 0 < again["doubles"], kernel
 
 
 @pytest.mark.slow

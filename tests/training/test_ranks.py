@@ -13,7 +13,7 @@ from pathlib import Path
 import lightning.pytorch as pl
 import pytest
 import torch
-from lightning.pytorch.strategies import DDPStrategy
+from hydra.utils import instantiate
 from torch import nn
 
 from raytran.data.collate import collate_scenes
@@ -28,6 +28,7 @@ from raytran.training.ranks import (
     BatchNorm3dOverRanks,
     SyncedBatchNorm,
     agree,
+    average_statistics,
     mean_over_ranks,
 )
 
@@ -164,6 +165,21 @@ def test_two_ranks_and_an_empty_scene_take_the_step_of_one_rank(scenes, two_rank
     # Gradients of scale and shift are each rank's own: DistributedDataParallel adds them up.
     both = [a + b for a, b in zip(two_ranks[0]["norm"][2:4], two_ranks[1]["norm"][2:4], strict=True)]
     torch.testing.assert_close(both, [norm.weight.grad, norm.bias.grad], rtol=0, atol=1e-4)
+    # Norms of a rank's own: what is trained is one network, whose statistics are those of all images.
+    for name, value in two_ranks[0]["alone"].items():
+        assert torch.equal(value, two_ranks[1]["alone"][name]), name
+    assert any(
+        not torch.equal(value, two_ranks[0]["stage1"]["weights"][name])
+        for name, value in two_ranks[0]["alone"].items()
+    )
+    mean = images.mean(dim=(0, 2, 3))
+    within = images.var(dim=(2, 3)).mean(dim=0)
+    between = images.mean(dim=(2, 3)).var(dim=0, correction=0)
+    for rank in two_ranks:
+        torch.testing.assert_close(rank["averaged"]["0.running_mean"], mean)
+        torch.testing.assert_close(rank["averaged"]["0.running_var"], within + between)
+        assert torch.equal(rank["averaged"]["1.running_mean"], torch.zeros(2) + 1 / 3)
+        assert torch.equal(rank["averaged"]["1.running_var"], torch.ones(2))
     for rank in two_ranks:
         assert rank["mean"].tolist() == [0.5, 10.0]
         assert (rank["same"], rank["last_bit"], rank["order"]) == (True, False, False)
@@ -207,16 +223,26 @@ def test_alone_the_batch_norm_is_pytorchs(usual, size):
     torch.testing.assert_close(ours.eval()(images), theirs.eval()(images), rtol=1e-5, atol=1e-5)
 
 
+def strategy_of_two():
+    """Return the strategy that ``trainer=ddp_cpu`` has."""
+    return instantiate(compose("train", ["trainer=ddp_cpu", "output_dir=unused"]).trainer.strategy)
+
+
 def run_rank(folder):
     rank = int(os.environ["RANK"])
     batches = [step[rank] for step in torch.load(folder / "scenes.pt", weights_only=False)]
     found = {}
     for run in RUNS:
         plugins = [SyncedBatchNorm(on_cpu=True)]
-        strategy = DDPStrategy(process_group_backend="gloo")
-        found[run] = fit(run, batches, devices=2, strategy=strategy, plugins=plugins)
+        found[run] = fit(run, batches, devices=2, strategy=strategy_of_two(), plugins=plugins)
     images = torch.randn(2, 3, 4, 5, generator=torch.Generator().manual_seed(0))[rank : rank + 1]
     found["norm"] = normalize(images, BatchNorm2dOverRanks(3))
+    found["alone"] = fit("stage1", batches, devices=2, strategy=strategy_of_two())["weights"]
+    norms = nn.Sequential(nn.BatchNorm2d(3, momentum=1.0), nn.BatchNorm3d(2).requires_grad_(False))
+    norms[0](images)
+    norms[1].running_mean += 1 / 3
+    average_statistics(norms)
+    found["averaged"] = norms.state_dict()
     found["mean"] = mean_over_ranks(torch.tensor([float(rank), 10.0]))
     here, values = torch.device("cpu"), [torch.arange(5.0), torch.ones(2).bfloat16(), torch.tensor(3)]
     found["same"] = agree(values, here)

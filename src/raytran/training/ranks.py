@@ -45,6 +45,34 @@ def agree(tensors: Iterable[Tensor], device: torch.device) -> bool:
     return bool(torch.equal(least, most))
 
 
+@torch.no_grad()
+def average_statistics(model: nn.Module) -> None:
+    """Give batch norms that each rank computes alone the statistics of all ranks' images together.
+
+    All ranks must call this together. Means of means, and variances by the law of total variance. Statistics
+    that are the same on all ranks stay what they are to the last bit, frozen ones among them.
+    """
+    norms = [norm for norm in model.modules() if isinstance(norm, _BatchNorm) and type(norm) in _OVER_RANKS]
+    statistics = [
+        (norm.running_mean, norm.running_var)
+        for norm in norms
+        if norm.running_mean is not None and norm.running_var is not None
+    ]
+    if not (statistics and dist.is_available() and dist.is_initialized()):
+        return
+    # float64 adds up equal numbers, and their squares, without rounding.
+    mean = torch.cat([mean for mean, _ in statistics]).double()
+    variance = torch.cat([variance for _, variance in statistics]).double()
+    sums = torch.stack([mean, mean.square(), variance])
+    dist.all_reduce(sums)
+    mean, squares, variance = (sums / dist.get_world_size()).unbind()
+    sizes = [len(own) for own, _ in statistics]
+    both = mean.split(sizes), (variance + (squares - mean.square())).split(sizes)
+    for own, *of_all in zip(statistics, *both, strict=True):
+        for tensor, value in zip(own, of_all, strict=True):
+            tensor.copy_(value)
+
+
 class SyncedBatchNorm(TorchSyncBatchNorm):
     """Batch norm over the images, or voxels, of all ranks: on GPUs by PyTorch's own and on CPUs too.
 

@@ -140,9 +140,10 @@ def test_operator_is_registered_as_torch_wants_it(shaped_pairs, generator):
     pairs = shaped_pairs((1, 3, 5), (1, 2, 2, 2), 0.5)
     inputs = _inputs(pairs, "pixels_to_voxels", 1, 16, generator)
     blocks = pairs.blocks().to(DEVICE)
-    orders = [block_attention.tensors_of(blocks.by(side)) for side in ("voxels", "pixels")]
-    layouts = [block_attention.layout_of(tiling) for tiling in (blocks.voxels, blocks.pixels)]
-    torch.library.opcheck(block_attention._attend, (*inputs, blocks.masks, *orders, *layouts))
+    sides = [(blocks.voxels, blocks.by("voxels")), (blocks.pixels, blocks.by("pixels"))]
+    numbers = [order.numbers for _, order in sides]
+    layouts = [block_attention.layout_of(*side) for side in sides]
+    torch.library.opcheck(block_attention._attend, (*inputs, blocks.masks, *numbers, *layouts))
 
 
 @both_directions
@@ -208,15 +209,16 @@ def test_autocast_changes_nothing(shaped_pairs, generator):
 
 def test_tuples_of_the_kernels_hold_tensors_alone(random_pairs, generator):
     """A number in one that is 1 is a constant, which Triton before 3.8 loses on its way to a function."""
-    from raytran.ops.triton.attention import Launch, layout_of, tensors_of
+    from raytran.ops.triton.attention import Launch, layout_of
 
     blocks = random_pairs(9, 14, 0.4).blocks()
     query, key, _ = _inputs(random_pairs(9, 14, 0.4), "pixels_to_voxels", 1, 16, generator)
-    layouts = layout_of(blocks.voxels), layout_of(blocks.pixels)
-    launch = Launch(query, key, tensors_of(blocks.by("voxels")), *layouts)
+    by_voxel, by_pixel = blocks.by("voxels"), blocks.by("pixels")
+    layouts = layout_of(blocks.voxels, by_voxel), layout_of(blocks.pixels, by_pixel)
+    launch = Launch(query, key, by_voxel.numbers, *layouts)
     tensors, *sizes = launch.arguments(blocks.masks)
     assert all(isinstance(tensor, Tensor) for tensor in tensors)
-    assert sizes[:3] == [14, 9, 1]
+    assert sizes[1:4] == [14, 9, 1]
 
 
 @pytest.mark.parametrize(

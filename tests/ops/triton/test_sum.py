@@ -50,10 +50,11 @@ def test_equals_a_matrix_product(
 
 def test_operator_is_registered_as_torch_wants_it(shaped_pairs, generator):
     from raytran.ops.triton import sum as block_sum
-    from raytran.ops.triton.attention import layout_of, tensors_of
+    from raytran.ops.triton.attention import layout_of
 
     blocks = shaped_pairs((1, 3, 5), (1, 2, 2, 2), 0.5).blocks().to(DEVICE)
     features = torch.randn(15, 16, generator=generator).to(DEVICE).requires_grad_()
-    orders = [tensors_of(blocks.by(side)) for side in ("voxels", "pixels")]
-    layouts = [layout_of(tiling) for tiling in (blocks.voxels, blocks.pixels)]
-    torch.library.opcheck(block_sum._sum, (features, blocks.masks, *orders, *layouts, 8))
+    sides = [(blocks.voxels, blocks.by("voxels")), (blocks.pixels, blocks.by("pixels"))]
+    numbers = [order.numbers for _, order in sides]
+    layouts = [layout_of(*side) for side in sides]
+    torch.library.opcheck(block_sum._sum, (features, blocks.masks, *numbers, *layouts, 8))

@@ -67,27 +67,22 @@ def block_attention(
         key,
         value,
         blocks.masks,
-        tensors_of(by_target),
-        tensors_of(by_source),
-        layout_of(targets),
-        layout_of(sources),
+        by_target.numbers,
+        by_source.numbers,
+        layout_of(targets, by_target),
+        layout_of(sources, by_source),
     )
 
 
-def tensors_of(order: BlockOrder) -> list[Tensor]:
-    """Return an order as an operator takes it."""
-    return [order.part_start, order.place, order.items, order.merges]
-
-
-def layout_of(tiling: Tiling) -> list[int]:
-    """Return the sizes of a tiling's boxes, of their parts and of a grid as an operator takes them."""
+def layout_of(tiling: Tiling, order: BlockOrder) -> list[int]:
+    """Return the sizes of boxes, parts, a grid and an order as an operator takes them."""
     grid = (1, 1, _LONGEST_RUN) if tiling.is_run else tiling.shape[1:]
-    return [*tiling.tile, *tiling.part, *grid]
+    return [*tiling.tile, *tiling.part, *grid, order.num_items, order.num_merges]
 
 
 def constants_of(layout: Sequence[int]) -> tuple[tuple[int, ...], ...]:
     """Return ``layout_of`` as the kernels take it: box, part, grid."""
-    return tuple(layout[:3]), tuple(layout[3:6]), tuple(layout[6:])
+    return tuple(layout[:3]), tuple(layout[3:6]), tuple(layout[6:9])
 
 
 @torch.library.custom_op("raytran::block_attention", mutates_args=())
@@ -96,8 +91,8 @@ def _attend(
     key: Tensor,
     value: Tensor,
     masks: Tensor,
-    by_target: Sequence[Tensor],
-    by_source: Sequence[Tensor],
+    by_target: Tensor,
+    by_source: Tensor,
     targets: Sequence[int],
     sources: Sequence[int],
 ) -> tuple[Tensor, Tensor]:
@@ -119,8 +114,8 @@ def _attend_backward(
     grad: Tensor,
     saved: Sequence[Tensor],
     masks: Tensor,
-    by_target: Sequence[Tensor],
-    by_source: Sequence[Tensor],
+    by_target: Tensor,
+    by_source: Tensor,
     targets: Sequence[int],
     sources: Sequence[int],
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -155,8 +150,8 @@ class Launch:
     Args:
         row: ``(R, H, D)`` a tensor of the rows' side, targets or sources.
         other: ``(J, H, D)`` one of the other side, of the dtype that is multiplied in.
-        order: tensors of the ``BlockOrder`` of the rows.
-        rows: layout of the rows' grid.
+        order: numbers of the ``BlockOrder`` of the rows.
+        rows: layout of the rows' grid and order.
         others: layout of the other grid.
     """
 
@@ -164,7 +159,7 @@ class Launch:
         self,
         row: Tensor,
         other: Tensor,
-        order: Sequence[Tensor],
+        order: Tensor,
         rows: Sequence[int],
         others: Sequence[int],
     ) -> None:
@@ -173,29 +168,28 @@ class Launch:
         self._num_others, self._dtype = other.shape[0], other.dtype
         self._rows, self._others = constants_of(rows), constants_of(others)
         self._width = max(16, triton.next_power_of_2(self._dim))
-        self.grid = (order[2].shape[0] * self._heads,)
+        num_items, self._num_merges = rows[9:]
+        self._merges_at = 4 * num_items
+        self.grid = (num_items * self._heads,)
         self.num_warps = warps_of(self._dtype, self._width)
 
     def scratch(self, width: int) -> Tensor:
         """Return memory for the pieces of long rows."""
-        return self._row.new_empty(
-            2 * self._order[3].shape[0] * ROW * self._heads * width, dtype=torch.float32
-        )
+        return self._row.new_empty(2 * self._num_merges * ROW * self._heads * width, dtype=torch.float32)
 
     def arguments(self, masks: Tensor) -> tuple[Any, ...]:
         """Return the kernels' arguments from ``order`` on."""
         # The interpreter multiplies float32 alone rightly; elsewhere operands stay what they are.
         operand = tl.float32 if INTERPRETED else _OPERANDS[self._dtype]
-        sizes = self._num_rows, self._num_others, self._heads
-        return (*self._order[:3], masks), *sizes, self._rows, self._others, self._dim, self._width, operand
+        sizes = self._merges_at + 3 * self._num_merges, self._num_rows, self._num_others, self._heads
+        return (self._order, masks), *sizes, self._rows, self._others, self._dim, self._width, operand
 
     def merge(self, kernel: Any, result: Any, parts: Any) -> None:
         """Put the pieces of long rows together."""
-        merges = self._order[3]
-        if merges.shape[0]:
-            sizes = self._num_rows, self._heads
-            kernel[merges.shape[0] * self._heads,](
-                result, parts, merges, *sizes, self._rows, self._dim, self._width
+        if self._num_merges:
+            sizes = self._merges_at, self._num_rows, self._heads
+            kernel[self._num_merges * self._heads,](
+                result, parts, self._order, *sizes, self._rows, self._dim, self._width
             )
 
 
@@ -214,13 +208,13 @@ def _(grad: Tensor, saved: Sequence[Tensor], *_: Any) -> tuple[Tensor, Tensor, T
 def _keep(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
     query, key, value, masks, by_target, by_source, *ctx.layout = inputs
     ctx.mark_non_differentiable(output[1])
-    ctx.save_for_backward(query, key, value, *output, masks, *by_target, *by_source)
+    ctx.save_for_backward(query, key, value, *output, masks, by_target, by_source)
 
 
 def _gradients(ctx: Any, grad: Tensor, _: Tensor) -> tuple[Any, ...]:
-    saved = list(ctx.saved_tensors)
-    gradients = _attend_backward(grad, saved[:5], saved[5], saved[6:10], saved[10:], *ctx.layout)
-    return *gradients, None, [None] * 4, [None] * 4, None, None
+    *saved, masks, by_target, by_source = ctx.saved_tensors
+    gradients = _attend_backward(grad, saved, masks, by_target, by_source, *ctx.layout)
+    return *gradients, None, None, None, None, None
 
 
 _attend.register_autograd(_gradients, setup_context=_keep)

@@ -16,13 +16,14 @@ from raytran.ops.triton.attention_kernels import (
 )
 
 
-@triton.jit(do_not_specialize=["num_rows", "num_others"])
+@triton.jit(do_not_specialize=["parts_at", "num_rows", "num_others"])
 def attend_backward_targets(
     inputs: tl.tuple,
     saved: tl.tuple,
     outputs: tl.tuple,
     part_ptr: tl.tensor,
     order: tl.tuple,
+    parts_at: tl.tensor,
     num_rows: tl.tensor,
     num_others: tl.tensor,
     heads: tl.tensor,
@@ -38,7 +39,7 @@ def attend_backward_targets(
     ``outputs`` are the gradient of the queries and that sum.
     """
     scale: tl.constexpr = DIM**-0.5
-    item_ptr, head = order[2] + tl.program_id(0) // heads * 4, tl.program_id(0) % heads
+    item_ptr, head = order[0] + tl.program_id(0) // heads * 4, tl.program_id(0) % heads
     start, last, slot = tl.load(item_ptr), tl.load(item_ptr + 2), tl.load(item_ptr + 3)
     if start < 0:
         return
@@ -54,7 +55,7 @@ def attend_backward_targets(
     offsets = part_offsets(OTHERS)
     summed = tl.zeros((32, WIDTH), tl.float32)
     for first in range(tl.load(item_ptr + 1), last, 8):
-        source, exists, joined = load_parts(order, first, last, offsets, num_others)
+        source, exists, joined = load_parts(order, parts_at, first, last, offsets, num_others)
         key = load_elements(inputs[1], source, exists, head, heads, DIM, WIDTH, OPERAND)
         value = load_elements(inputs[2], source, exists, head, heads, DIM, WIDTH, OPERAND)
         score = tl.dot(query, tl.trans(key), input_precision="ieee")
@@ -66,13 +67,14 @@ def attend_backward_targets(
     store_sum(outputs[0], part_ptr, summed * scale, target, inside, slot, head, heads, DIM)
 
 
-@triton.jit(do_not_specialize=["num_rows", "num_others"])
+@triton.jit(do_not_specialize=["parts_at", "num_rows", "num_others"])
 def attend_backward_sources(
     inputs: tl.tuple,
     saved: tl.tuple,
     outputs: tl.tuple,
     parts: tl.tuple,
     order: tl.tuple,
+    parts_at: tl.tensor,
     num_rows: tl.tensor,
     num_others: tl.tensor,
     heads: tl.tensor,
@@ -88,7 +90,7 @@ def attend_backward_sources(
     of ``attend_backward_targets``.
     """
     scale: tl.constexpr = DIM**-0.5
-    item_ptr, head = order[2] + tl.program_id(0) // heads * 4, tl.program_id(0) % heads
+    item_ptr, head = order[0] + tl.program_id(0) // heads * 4, tl.program_id(0) % heads
     start, last, slot = tl.load(item_ptr), tl.load(item_ptr + 2), tl.load(item_ptr + 3)
     if start < 0:
         return
@@ -98,7 +100,7 @@ def attend_backward_sources(
     offsets = part_offsets(OTHERS)
     d_key, d_value = tl.zeros((32, WIDTH), tl.float32), tl.zeros((32, WIDTH), tl.float32)
     for first in range(tl.load(item_ptr + 1), last, 8):
-        target, exists, joined = load_parts(order, first, last, offsets, num_others)
+        target, exists, joined = load_parts(order, parts_at, first, last, offsets, num_others)
         query = load_elements(inputs[0], target, exists, head, heads, DIM, WIDTH, OPERAND)
         grad = load_elements(inputs[4], target, exists, head, heads, DIM, WIDTH, OPERAND)
         at = target.to(tl.int64) * heads + head
@@ -116,11 +118,12 @@ def attend_backward_sources(
     store_sum(outputs[1], parts[1], d_value, source, inside, slot, head, heads, DIM)
 
 
-@triton.jit(do_not_specialize=["num_rows"])
+@triton.jit(do_not_specialize=["merges_at", "num_rows"])
 def merge_sums(
     out_ptr: tl.tensor,
     part_ptr: tl.tensor,
-    merges_ptr: tl.tensor,
+    order_ptr: tl.tensor,
+    merges_at: tl.tensor,
     num_rows: tl.tensor,
     heads: tl.tensor,
     ROWS: tl.constexpr,
@@ -128,7 +131,7 @@ def merge_sums(
     WIDTH: tl.constexpr,
 ) -> None:
     """Add up the pieces of a long row, in their order."""
-    merge_ptr, head = merges_ptr + tl.program_id(0) // heads * 3, tl.program_id(0) % heads
+    merge_ptr, head = order_ptr + merges_at + tl.program_id(0) // heads * 3, tl.program_id(0) % heads
     start = tl.load(merge_ptr)
     if start < 0:
         return

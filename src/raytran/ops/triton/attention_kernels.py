@@ -17,10 +17,11 @@ read the inputs and write the outputs takes 0.045 ms. Reckoned from the compiled
 
 "Source" and "target" are those of the attention; in ``attend_backward_sources`` the rows are sources. ``DIM``
 channels of a head are padded to a power of two, ``WIDTH``. Logarithms are to base 2. Arguments that belong
-together are tuples: ``order`` is (part_start, place, items) of a ``BlockOrder`` and the masks. ``ROWS`` and
-``OTHERS`` are constants, the (box, part, grid) of a ``Tiling`` along its three axes, the number of grids left
-out: a new number of views compiles nothing. Each is an argument of its own, and numbers that may be 1 are in
-no tuple, because Triton before 3.8 loses constants that it passes on out of a tuple.
+together are tuples: ``order`` is the numbers of a ``BlockOrder``, whose parts stand from ``parts_at`` on, and
+the masks. ``ROWS`` and ``OTHERS`` are constants, the (box, part, grid) of a ``Tiling`` along its three axes,
+the number of grids left out: a new number of views compiles nothing. Each is an argument of its own, and
+numbers that may be 1 are in no tuple, because Triton before 3.8 loses constants that it passes on out of a
+tuple.
 """
 
 from __future__ import annotations
@@ -74,14 +75,20 @@ def part_offsets(TILE: tl.constexpr) -> tl.tensor:
 
 @triton.jit
 def load_parts(
-    order: tl.tuple, first: tl.tensor, last: tl.tensor, offsets: tl.tensor, number: tl.tensor
+    order: tl.tuple,
+    parts_at: tl.tensor,
+    first: tl.tensor,
+    last: tl.tensor,
+    offsets: tl.tensor,
+    number: tl.tensor,
 ) -> tl.tuple:
     """Return the elements of 8 parts, ``(64,)``, whether they exist, and which are joined, ``(32, 64)``."""
     part = first + tl.arange(0, 64) // 8
     listed = part < last
-    element = tl.load(order[0] + part, mask=listed, other=0) + offsets
-    place = tl.load(order[1] + part, mask=listed, other=0).to(tl.int64) * 8
-    words = tl.load(order[3] + place + tl.arange(0, 64) % 8, mask=listed, other=0)
+    part_ptr = order[0] + parts_at + part * 2
+    element = tl.load(part_ptr, mask=listed, other=0) + offsets
+    place = tl.load(part_ptr + 1, mask=listed, other=0).to(tl.int64) * 8
+    words = tl.load(order[1] + place + tl.arange(0, 64) % 8, mask=listed, other=0)
     joined = ((words[None, :] >> tl.arange(0, 32)[:, None]) & 1) != 0
     return element, listed & (element < number), joined
 
@@ -125,12 +132,13 @@ def store_sum(
         tl.store(part_ptr + row * DIM + channel, summed, mask=(row >= 0) & (channel < DIM))
 
 
-@triton.jit(do_not_specialize=["num_rows", "num_others"])
+@triton.jit(do_not_specialize=["parts_at", "num_rows", "num_others"])
 def attend_forward(
     inputs: tl.tuple,
     outputs: tl.tuple,
     parts: tl.tuple,
     order: tl.tuple,
+    parts_at: tl.tensor,
     num_rows: tl.tensor,
     num_others: tl.tensor,
     heads: tl.tensor,
@@ -142,7 +150,7 @@ def attend_forward(
 ) -> None:
     """Give a row's targets the mean of the values they attend to, and the log-sum-exp of their scores."""
     scale: tl.constexpr = DIM**-0.5 * LOG2_E
-    item_ptr, head = order[2] + tl.program_id(0) // heads * 4, tl.program_id(0) % heads
+    item_ptr, head = order[0] + tl.program_id(0) // heads * 4, tl.program_id(0) % heads
     start, last, slot = tl.load(item_ptr), tl.load(item_ptr + 2), tl.load(item_ptr + 3)
     if start < 0:
         return
@@ -153,7 +161,7 @@ def attend_forward(
     total = tl.zeros((32,), tl.float32)
     summed = tl.zeros((32, WIDTH), tl.float32)
     for first in range(tl.load(item_ptr + 1), last, 8):
-        source, exists, joined = load_parts(order, first, last, offsets, num_others)
+        source, exists, joined = load_parts(order, parts_at, first, last, offsets, num_others)
         key = load_elements(inputs[1], source, exists, head, heads, DIM, WIDTH, OPERAND)
         value = load_elements(inputs[2], source, exists, head, heads, DIM, WIDTH, OPERAND)
         score = tl.dot(query, tl.trans(key), input_precision="ieee")
@@ -198,11 +206,12 @@ def _finish(
         tl.store(parts[1] + (slot * heads + head) * 32 + tl.arange(0, 32), logsumexp)
 
 
-@triton.jit(do_not_specialize=["num_rows"])
+@triton.jit(do_not_specialize=["merges_at", "num_rows"])
 def merge_forward(
     outputs: tl.tuple,
     parts: tl.tuple,
-    merges_ptr: tl.tensor,
+    order_ptr: tl.tensor,
+    merges_at: tl.tensor,
     num_rows: tl.tensor,
     heads: tl.tensor,
     ROWS: tl.constexpr,
@@ -210,7 +219,7 @@ def merge_forward(
     WIDTH: tl.constexpr,
 ) -> None:
     """Join the pieces of a long row: the mean of their means, weighted by their sums."""
-    merge_ptr, head = merges_ptr + tl.program_id(0) // heads * 3, tl.program_id(0) % heads
+    merge_ptr, head = order_ptr + merges_at + tl.program_id(0) // heads * 3, tl.program_id(0) % heads
     start = tl.load(merge_ptr)
     if start < 0:
         return

@@ -37,19 +37,55 @@ class BlockOrder(NamedTuple):
     near a camera) is cut into pieces. The kernels take one item each; what they find for a piece goes to a
     slot of scratch memory, and a second pass adds up each row's slots.
 
+    All is one tensor, because the host needs longer to hand over a tensor than a GPU to read one.
+
     Attributes:
-        part_start: ``(L,)`` int32, first element of each part, row after row.
-        place: ``(L,)`` int32, the place of each part's mask, 8 words, in ``BlockPairs.masks``.
-        items: ``(I, 4)`` int32, longest first: the row's first element, -1 for an unused item; its parts
-            ``first:last``; and the slot for the result, -1 where the item is the whole row.
-        merges: ``(R, 3)`` int32: the first element of a row that is cut, -1 if unused; its slots
-            ``first:last``. A row has two at least, so that there are at most 2 · R.
+        numbers: int32, ``items``, ``merges`` and the parts one after another.
+        num_items: I.
+        num_merges: R.
     """
 
-    part_start: Tensor
-    place: Tensor
-    items: Tensor
-    merges: Tensor
+    numbers: Tensor
+    num_items: int
+    num_merges: int
+
+    @classmethod
+    def of(cls, part_start: Tensor, place: Tensor, items: Tensor, merges: Tensor) -> BlockOrder:
+        """Return the order of these; see the properties."""
+        parts = torch.stack([part_start, place], dim=1)
+        flat = [part.flatten().int() for part in (items, merges, parts)]
+        return cls(torch.cat(flat), items.shape[0], merges.shape[0])
+
+    @property
+    def items(self) -> Tensor:
+        """``(I, 4)`` int32, longest first.
+
+        The row's first element, -1 for an unused item; its parts ``first:last``; and the slot for the result,
+        -1 where the item is the whole row.
+        """
+        return self.numbers[: 4 * self.num_items].view(-1, 4)
+
+    @property
+    def merges(self) -> Tensor:
+        """``(R, 3)`` int32: the first element of a row that is cut, -1 if unused; its slots ``first:last``.
+
+        A row has two at least, so that there are at most 2 · R.
+        """
+        return self.numbers[4 * self.num_items : 4 * self.num_items + 3 * self.num_merges].view(-1, 3)
+
+    @property
+    def part_start(self) -> Tensor:
+        """``(L,)`` int32, first element of each part, row after row."""
+        return self._parts[:, 0]
+
+    @property
+    def place(self) -> Tensor:
+        """``(L,)`` int32, the place of each part's mask, 8 words, in ``BlockPairs.masks``."""
+        return self._parts[:, 1]
+
+    @property
+    def _parts(self) -> Tensor:
+        return self.numbers[4 * self.num_items + 3 * self.num_merges :].view(-1, 2)
 
 
 @dataclass(frozen=True)
@@ -159,7 +195,7 @@ class BlockPairs(TensorStruct):
         items, merges = _schedule(offsets, rows.start(number[:-1]))
         part_start = others.start(other)[pair] + others.offset(part * PART)
         place = (pair * 2 + side) * PARTS + part
-        return BlockOrder(part_start.int(), place.int(), items, merges)
+        return BlockOrder.of(part_start, place, items, merges)
 
 
 def _schedule(offsets: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
@@ -177,13 +213,13 @@ def _schedule(offsets: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
     first = offsets[row] + number * piece
     last = torch.minimum(first + piece, offsets[row + 1])
     slot = (slots_before[row] + number).where(cut[row], -1)
-    items = torch.stack([start[row].where(used, -1), first, last, slot], dim=1).int()
+    items = torch.stack([start[row].where(used, -1), first, last, slot], dim=1)
     longest_first = torch.argsort((last - first).where(used, -1), descending=True, stable=True)
 
     cuts_before = _before(cut.long())
     row = torch.searchsorted(cuts_before[1:], torch.arange(_SLOTS // 2, device=device), right=True)
     used, row = row < num_rows, row.clamp(max=num_rows - 1)
-    merges = torch.stack([start[row].where(used, -1), slots_before[row], slots_before[row + 1]], dim=1).int()
+    merges = torch.stack([start[row].where(used, -1), slots_before[row], slots_before[row + 1]], dim=1)
     return items[longest_first], merges
 
 

@@ -12,7 +12,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from raytran.ops.triton.attention import Launch, layout_of, tensors_of
+from raytran.ops.triton.attention import Launch, layout_of
 from raytran.ops.triton.attention_backward_kernels import merge_sums
 from raytran.ops.triton.attention_kernels import (
     box_elements,
@@ -33,10 +33,10 @@ def block_sum(features: Tensor, blocks: BlockPairs) -> Tensor:
     return _sum(
         features,
         blocks.masks,
-        tensors_of(by_voxel),
-        tensors_of(by_pixel),
-        layout_of(blocks.voxels),
-        layout_of(blocks.pixels),
+        by_voxel.numbers,
+        by_pixel.numbers,
+        layout_of(blocks.voxels, by_voxel),
+        layout_of(blocks.pixels, by_pixel),
         blocks.num_voxels,
     )
 
@@ -45,8 +45,8 @@ def block_sum(features: Tensor, blocks: BlockPairs) -> Tensor:
 def _sum(
     source: Tensor,
     masks: Tensor,
-    by_target: Sequence[Tensor],
-    by_source: Sequence[Tensor],
+    by_target: Tensor,
+    by_source: Tensor,
     targets: Sequence[int],
     sources: Sequence[int],
     num_targets: int,
@@ -65,12 +65,13 @@ def _sum(
     return out.view(num_targets, channels)
 
 
-@triton.jit(do_not_specialize=["num_rows", "num_others"])
+@triton.jit(do_not_specialize=["parts_at", "num_rows", "num_others"])
 def sum_boxes(
     source_ptr: tl.tensor,
     out_ptr: tl.tensor,
     part_ptr: tl.tensor,
     order: tl.tuple,
+    parts_at: tl.tensor,
     num_rows: tl.tensor,
     num_others: tl.tensor,
     heads: tl.tensor,
@@ -81,14 +82,14 @@ def sum_boxes(
     OPERAND: tl.constexpr,
 ) -> None:
     """Sum over each target of a row the sources it is joined with, for one group of channels."""
-    item_ptr, head = order[2] + tl.program_id(0) // heads * 4, tl.program_id(0) % heads
+    item_ptr, head = order[0] + tl.program_id(0) // heads * 4, tl.program_id(0) % heads
     start, last, slot = tl.load(item_ptr), tl.load(item_ptr + 2), tl.load(item_ptr + 3)
     if start < 0:
         return
     offsets = part_offsets(OTHERS)
     summed = tl.zeros((32, WIDTH), tl.float32)
     for first in range(tl.load(item_ptr + 1), last, 8):
-        source, exists, joined = load_parts(order, first, last, offsets, num_others)
+        source, exists, joined = load_parts(order, parts_at, first, last, offsets, num_others)
         feature = load_elements(source_ptr, source, exists, head, heads, DIM, WIDTH, OPERAND)
         summed = tl.dot(joined.to(OPERAND), feature, summed, input_precision="ieee")
     target, inside = box_elements(start, num_rows, ROWS)
@@ -96,21 +97,21 @@ def sum_boxes(
 
 
 @_sum.register_fake
-def _(source: Tensor, masks: Tensor, by_target: Sequence[Tensor], *rest: Any) -> Tensor:
+def _(source: Tensor, masks: Tensor, by_target: Tensor, *rest: Any) -> Tensor:
     return source.new_empty((rest[-1], source.shape[1]), dtype=torch.float32)
 
 
 def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
     source, masks, by_target, by_source, *ctx.layout = inputs
-    ctx.save_for_backward(masks, *by_target, *by_source)
+    ctx.save_for_backward(masks, by_target, by_source)
     ctx.source = source.shape[0], source.dtype
 
 
 def _gradients(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
-    masks, *orders = ctx.saved_tensors
+    masks, by_target, by_source = ctx.saved_tensors
     (number, dtype), (targets, sources, _) = ctx.source, ctx.layout
-    back = _sum(grad, masks, orders[4:], orders[:4], sources, targets, number)
-    return back.to(dtype), None, [None] * 4, [None] * 4, None, None, None
+    back = _sum(grad, masks, by_source, by_target, sources, targets, number)
+    return back.to(dtype), None, None, None, None, None, None
 
 
 _sum.register_autograd(_gradients, setup_context=_keep)

@@ -120,6 +120,9 @@ def build_trainer(
     settings["precision"] = choose_precision(str(settings["precision"]), on_cpu=on_cpu)
     # Lightning counts batches here, and the configs steps.
     settings["val_check_interval"] *= settings["accumulate_grad_batches"]
+    if settings["accumulate_grad_batches"] > 1 and isinstance(settings["strategy"], dict):
+        # A static graph is learned in the first backward pass, which here exchanges nothing.
+        settings["strategy"]["static_graph"] = False
     folder = Path(run.output_dir)
     callbacks: list[pl.Callback] = [
         stage,
@@ -141,7 +144,7 @@ def build_trainer(
         default_root_dir=str(folder),
         logger=[MetricsTable(folder / METRICS), *loggers],
         callbacks=callbacks,
-        plugins=[AtomicCheckpointIO(), SyncedBatchNorm(on_cpu=on_cpu)],
+        plugins=[AtomicCheckpointIO(), *([SyncedBatchNorm(on_cpu=on_cpu)] if cfg.sync_norms else [])],
         enable_progress_bar=run.progress_bar == "tqdm",
         _convert_="all",
     )

@@ -16,6 +16,7 @@ from raytran.errors import CheckpointError
 from raytran.training.callbacks.stop_signals import StopRequestedError, StopSignals
 from raytran.training.checkpoint_io import AtomicCheckpointIO
 from raytran.training.checkpoint_resume import loop_state, random_states, set_random_states
+from raytran.training.ranks import average_statistics
 
 _log = logging.getLogger(__name__)
 
@@ -159,6 +160,7 @@ class LastCheckpoint(pl.Callback):
             raise error
 
     def _write(self, trainer: pl.Trainer) -> None:
+        average_statistics(trainer.lightning_module)
         trainer.save_checkpoint(self._path)
         self._tried_at = trainer.global_step
         error = self._write_error(trainer)

@@ -11,7 +11,7 @@ import lightning.pytorch as pl
 
 from raytran.data.views import RepeatedFrames
 from raytran.errors import RaytranError
-from raytran.training.ranks import agree
+from raytran.training.ranks import agree, average_statistics
 
 _log = logging.getLogger(__name__)
 
@@ -61,6 +61,7 @@ class RankAgreement(pl.Callback):
     """Compares the ranks' weights and statistics bit by bit, at the start, at validations and at the end.
 
     Ranks whose weights differ would train on without an error, each its own network, of which one is saved.
+    Batch norms that each rank computes alone are given the statistics of all ranks first.
     """
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
@@ -78,6 +79,7 @@ class RankAgreement(pl.Callback):
     def _check(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         if trainer.world_size == 1:
             return
+        average_statistics(pl_module)
         if not agree(chain(pl_module.parameters(), pl_module.buffers()), pl_module.device):
             raise RaytranError(
                 f"the ranks' networks differ at step {trainer.global_step}: continue from an earlier "
