@@ -17,7 +17,7 @@ Units, frames and signs are in ``CONVENTIONS.md``.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
@@ -113,6 +113,13 @@ def cached(struct: TensorStruct, name: str, make: Callable[[], _Made]) -> _Made:
     if not hasattr(struct, name):
         object.__setattr__(struct, name, make())
     return getattr(struct, name)
+
+
+def sent_to(device: torch.device, tensor: Tensor) -> Tensor:
+    """Return a tensor of the CPU on ``device``, by way of page-locked memory: the host does not wait."""
+    if device.type in ("cpu", "mps"):
+        return tensor.to(device)
+    return tensor.pin_memory().to(device, non_blocking=True)
 
 
 @dataclass(frozen=True)
@@ -301,6 +308,13 @@ class RawObjects(TensorStruct):
         """Return the predictions in float32, but for the embedding: it goes back into the network."""
         exact = {f.name: getattr(self, f.name).float() for f in fields(self) if f.name != "embedding"}
         return replace(self, **exact)
+
+    @staticmethod
+    def stack(layers: Sequence[RawObjects]) -> RawObjects:
+        """Return layers as one, ``(L, B, Q, ...)``."""
+        return RawObjects(
+            *(torch.stack([getattr(one, f.name) for one in layers]) for f in fields(RawObjects))
+        )
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from raytran.losses.matcher import HungarianMatcher
-from raytran.losses.objects import Match
+from raytran.losses.objects import TrueObjects
 from raytran.structs import PADDING, ObjectSet, RawObjects
 from raytran.training.ranks import mean_over_ranks
 
@@ -41,7 +41,11 @@ def slot_signals(
         mean number of objects over that of queries; if it stays 0, the padding class has won.
     """
     objects = RawObjects(**{name: value.float() for name, value in vars(objects).items()})
-    right, matched = _count_right(objects, targets, matcher(objects, targets))
+    true = TrueObjects.of(*targets)
+    match = matcher(RawObjects.stack([objects]), true, [len(of_scene) for of_scene in targets])
+    surest = objects.class_logits.argmax(dim=-1).flatten()[match.query[0]]
+    right = (surest == true.label[match.target[0]]).float().sum()
+    matched = right.new_full((), match.query.shape[1])
     log_probability = objects.class_logits.log_softmax(dim=-1)
     entropy = -(log_probability.exp() * log_probability).sum(dim=-1) / math.log(PADDING + 1)
     used = (log_probability.argmax(dim=-1) != PADDING).float()
@@ -49,19 +53,6 @@ def slot_signals(
     right, matched, entropy, used = mean_over_ranks(sums).unbind()
     found = {"class_entropy": entropy, "slots_used": used}
     return found | ({"class_accuracy": right / matched} if matched > 0 else {})
-
-
-def _count_right(
-    objects: RawObjects, targets: Sequence[ObjectSet], matches: Sequence[Match]
-) -> tuple[Tensor, Tensor]:
-    """Return the number of matched queries whose surest class is right, and of all of them."""
-    label = objects.class_logits.argmax(dim=-1)
-    hits = [
-        label[scene, match.query] == truth.label[match.target]
-        for scene, (truth, match) in enumerate(zip(targets, matches, strict=True))
-    ]
-    every = torch.cat(hits).float()
-    return every.sum(), every.new_tensor(len(every))
 
 
 class RunningStatistics:
