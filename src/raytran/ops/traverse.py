@@ -247,7 +247,7 @@ class RayTracer:
     def __call__(
         self, cameras: Cameras, grid: VoxelGrid, feature_size: tuple[int, int], rays_per_cell: int
     ) -> Pairs:
-        """Return the pairs of ``trace_pairs``, with both orders made; arguments and errors are its own.
+        """Return the pairs of ``trace_pairs``, with both orders and counts made; arguments are its own.
 
         Raises:
             ConfigError: ``attention`` is ``fused`` and the fused kernels do not run here.
@@ -263,6 +263,7 @@ class RayTracer:
             pairs = pairs if self.attention == "auto" else replace(pairs, fused=False)
         # Their sizes depend on the data: better here than in code compiled for one size.
         pairs.orders()
+        pairs.pixels_per_voxel()
         return pairs
 
     def _is_fused(self, device: torch.device) -> bool:

@@ -98,8 +98,11 @@ class Reconstruction(pl.LightningModule):
         return self.optimization.build(self.model.parameters(), int(self.trainer.estimated_stepping_batches))
 
     def _run_model(self, batch: SceneBatch) -> RawScene:
-        run = self._compiled or self.model
-        return run(**inputs_of(batch), tasks=self.stage.tasks)
+        run, inputs = self._compiled or self.model, inputs_of(batch)
+        traced = self.model.trace_views(
+            batch.views, grid_center=batch.grid_center, new_cameras=inputs["new_cameras"]
+        )
+        return run(**inputs, tasks=self.stage.tasks, traced=traced)
 
     def _losses(self, raw: RawScene, batch: SceneBatch, **options: Any) -> dict[str, Tensor]:
         return self.loss(
