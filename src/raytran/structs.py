@@ -19,7 +19,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from functools import lru_cache, wraps
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -120,6 +121,35 @@ def sent_to(device: torch.device, tensor: Tensor) -> Tensor:
     if device.type in ("cpu", "mps"):
         return tensor.to(device)
     return tensor.pin_memory().to(device, non_blocking=True)
+
+
+_Make = TypeVar("_Make", bound=Callable[..., Tensor])
+
+
+def kept_on_device(make: _Make) -> _Make:
+    """Let a function of plain values and ``device`` make its tensor once for each of them, not in every step.
+
+    On the CPU and in compiled code it is made anew: there it costs little, and may be a tensor without data.
+    Nobody may change what is kept.
+    """
+
+    @lru_cache(maxsize=64)
+    def kept(*values: Any, device: torch.device) -> Tensor:
+        with torch.inference_mode(False), torch.no_grad():
+            return make(*values, device=device)
+
+    @wraps(make)
+    def call(*values: Any, device: torch.device) -> Tensor:
+        at_once = device.type == "cpu" or torch.compiler.is_compiling()
+        return (make if at_once else kept)(*values, device=device)
+
+    return cast("_Make", call)
+
+
+@kept_on_device
+def constant(values: tuple[float, ...], dtype: torch.dtype, *, device: torch.device) -> Tensor:
+    """Return fixed numbers as a vector, for which the host never waits."""
+    return sent_to(device, torch.tensor(values, dtype=dtype))
 
 
 @dataclass(frozen=True)
