@@ -126,27 +126,33 @@ def sent_to(device: torch.device, tensor: Tensor) -> Tensor:
 _Make = TypeVar("_Make", bound=Callable[..., Tensor])
 
 
-def kept_on_device(make: _Make) -> _Make:
+def kept_on_device(most: int) -> Callable[[_Make], _Make]:
     """Let a function of plain values and ``device`` make its tensor once for each of them, not in every step.
 
     On the CPU and in compiled code it is made anew: there it costs little, and may be a tensor without data.
     Nobody may change what is kept.
+
+    Args:
+        most: results to keep.
     """
 
-    @lru_cache(maxsize=64)
-    def kept(*values: Any, device: torch.device) -> Tensor:
-        with torch.inference_mode(False), torch.no_grad():
-            return make(*values, device=device)
+    def decorate(make: _Make) -> _Make:
+        @lru_cache(maxsize=most)
+        def kept(*values: Any, device: torch.device) -> Tensor:
+            with torch.inference_mode(False), torch.no_grad():
+                return make(*values, device=device)
 
-    @wraps(make)
-    def call(*values: Any, device: torch.device) -> Tensor:
-        at_once = device.type == "cpu" or torch.compiler.is_compiling()
-        return (make if at_once else kept)(*values, device=device)
+        @wraps(make)
+        def call(*values: Any, device: torch.device) -> Tensor:
+            at_once = device.type == "cpu" or torch.compiler.is_compiling()
+            return (make if at_once else kept)(*values, device=device)
 
-    return cast("_Make", call)
+        return cast("_Make", call)
+
+    return decorate
 
 
-@kept_on_device
+@kept_on_device(64)
 def constant(values: tuple[float, ...], dtype: torch.dtype, *, device: torch.device) -> Tensor:
     """Return fixed numbers as a vector, for which the host never waits."""
     return sent_to(device, torch.tensor(values, dtype=dtype))

@@ -13,7 +13,7 @@ from torch.utils.checkpoint import checkpoint
 from raytran.backbone.block import RayTracedBlock
 from raytran.errors import ConfigError, ShapeError, check_shape
 from raytran.geometry.camera import Cameras
-from raytran.geometry.grid import VoxelGrid, position_code, ray_code
+from raytran.geometry.grid import VoxelGrid, ray_code, voxel_code
 from raytran.ops.pairs import Pairs
 from raytran.ops.splat import splat_in_chunks
 from raytran.ops.traverse import RayTracer
@@ -288,8 +288,9 @@ class Backbone(VoxelBackbone):
 
     def _voxel_positions(self, grid: VoxelGrid) -> Tensor:
         """Return the position embedding of the voxels, ``(X, Y, Z, C)``; that of every scene is the same."""
-        at_origin = VoxelGrid(grid.resolution, grid.extent, torch.zeros_like(self.voxel_position.bias[:3]))
-        return self.voxel_position(position_code(at_origin.voxel_centers(), grid.extent, self.channels))
+        bias, shape = self.voxel_position.bias, (grid.resolution, grid.extent)
+        code = voxel_code(*shape, grid.extent, self.channels, bias.dtype, device=bias.device)
+        return self.voxel_position(code)
 
     def _updates_pixels(self, index: int, *, with_pixels: bool) -> bool:
         """Say whether block ``index`` changes the pixels: of the last one only pixel features need it."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from raytran.errors import ShapeError, check_shape
-from raytran.structs import Views
+from raytran.structs import Views, kept_on_device
 
 
 @dataclass(frozen=True)
@@ -89,11 +89,7 @@ class Cameras:
         scaled = self.scaled_to((height, width))
         n = rays_per_cell
         dtype, device = self.intrinsics.dtype, self.intrinsics.device
-        part = (torch.arange(n, dtype=dtype, device=device) + 0.5) / n
-        v = torch.arange(height, dtype=dtype, device=device)[:, None, None, None] + part[:, None]
-        u = torch.arange(width, dtype=dtype, device=device)[None, :, None, None] + part
-        v, u = torch.broadcast_tensors(v, u)
-        image = torch.stack([u, v, torch.ones_like(u)], dim=-1).reshape(-1, 3)
+        image = _points_of_cells(height, width, n, dtype, device=device)
         # On a GPU an error check would make the host wait.
         inverse, _ = torch.linalg.inv_ex(scaled.intrinsics, check_errors=scaled.intrinsics.is_cpu)
         world_from_image = self.world_from_camera[..., :3, :3] @ inverse
@@ -116,6 +112,16 @@ class Cameras:
         in_image = in_camera @ self.intrinsics.transpose(-1, -2)
         depth = in_camera[..., 2]
         return in_image[..., :2] / in_image[..., 2:].where(in_image[..., 2:] != 0, 1.0), depth
+
+
+@kept_on_device(16)
+def _points_of_cells(height: int, width: int, n: int, dtype: torch.dtype, *, device: torch.device) -> Tensor:
+    """Return (u, v, 1) of n×n points in every cell of a map, ``(h·w·n·n, 3)``; a cell is 1 wide."""
+    part = (torch.arange(n, dtype=dtype, device=device) + 0.5) / n
+    v = torch.arange(height, dtype=dtype, device=device)[:, None, None, None] + part[:, None]
+    u = torch.arange(width, dtype=dtype, device=device)[None, :, None, None] + part
+    v, u = torch.broadcast_tensors(v, u)
+    return torch.stack([u, v, torch.ones_like(u)], dim=-1).reshape(-1, 3)
 
 
 def pose_from_heading(

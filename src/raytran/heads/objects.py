@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.quasirandom import SobolEngine
 
 from raytran.errors import ConfigError
-from raytran.geometry.grid import VoxelGrid, position_code
+from raytran.geometry.grid import VoxelGrid, centered_voxels, position_code, voxel_code
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.heads.decoder import DecoderLayer
 from raytran.structs import CLASSES, PADDING, ObjectSet, RawObjects, RawProposals
@@ -177,9 +177,11 @@ class ObjectHead(nn.Module):
             mask: ``(Q, Q)`` bool, which queries must not attend to which, see ``DecoderLayer.forward``.
         """
         grid_center = grid.center.to(self.extent.dtype)
-        at_origin = VoxelGrid(grid.resolution, grid.extent, torch.zeros_like(self.extent))
-        voxel_position = at_origin.voxel_centers().flatten(0, 2)
-        memory = voxels.flatten(1, 3) + self._encode_positions(voxel_position)
+        shape, like = (grid.resolution, grid.extent), self.extent
+        voxel_position = centered_voxels(*shape, like.dtype, device=like.device).flatten(0, 2)
+        channels = self.position.in_features
+        code = voxel_code(*shape, self.grid_extent, channels, like.dtype, device=like.device)
+        memory = voxels.flatten(1, 3) + self.position(code.flatten(0, 2))
         embedding = queries.embedding
         outputs = []
         for layer, predictor in zip(self.layers, self.predictors, strict=True):

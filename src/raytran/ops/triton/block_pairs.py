@@ -198,12 +198,12 @@ def _pieces(lengths: Tensor) -> tuple[Tensor, Tensor]:
     return choices.index_select(0, choice), pieces.index_select(0, choice)[0].clamp(min=1)
 
 
-@kept_on_device
+@kept_on_device(16)
 def _count_to(number: int, *, device: torch.device) -> Tensor:
     return torch.arange(number, dtype=torch.int32, device=device)
 
 
-@kept_on_device
+@kept_on_device(16)
 def _bits_of_bytes(*, device: torch.device) -> Tensor:
     """Return how many bits of each byte are set, ``(256,)`` uint8."""
     byte = torch.arange(256, device=device)[:, None]

@@ -115,12 +115,12 @@ class Tiling:
         return offset
 
 
-@kept_on_device
+@kept_on_device(16)
 def _starts(tiling: Tiling, *, device: torch.device) -> Tensor:
     tile = torch.arange(tiling.num_tiles, device=device)
     return torch.nn.functional.pad(tiling.start(tile), (0, 1), value=-1).int()
 
 
-@kept_on_device
+@kept_on_device(16)
 def _offsets(tiling: Tiling, *, device: torch.device) -> Tensor:
     return tiling.offset(torch.arange(ROW, device=device)).int()
