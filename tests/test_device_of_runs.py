@@ -207,6 +207,7 @@ def targets_of(stage):
 
 
 def fit(trainer, module, batches, **more):
+    batches = [batch.pin_memory() for batch in batches]  # as a loader does for a GPU
     # With generators of their own, loaders leave alone the random numbers of the training.
     training, validation = (
         DataLoader(some, batch_size=None, generator=torch.Generator()) for some in (batches, batches[:1])
