@@ -132,7 +132,7 @@ def voxel_code(
     *,
     device: torch.device,
 ) -> Tensor:
-    """Return ``position_code`` in a volume of all voxels, ``(X, Y, Z, C)``; kept: every scene has the same."""
+    """Return ``position_code`` of all voxels in a volume, ``(X, Y, Z, C)``; kept: all scenes have one."""
     return position_code(centered_voxels(resolution, extent, dtype, device=device), volume, channels)
 
 

@@ -55,7 +55,7 @@ class HungarianMatcher(nn.Module):
 
     @torch.no_grad()
     def forward(self, layers: RawObjects, targets: TrueObjects, counts: Sequence[int]) -> Match:
-        """Match the queries of every layer and scene with the scene's objects; P is the sum of min(Q, M).
+        """Match the queries of every layer with the objects of their scene; P is the sum of min(Q, M).
 
         The costs come to the host in one copy, for which it waits, and the pairs go back in one.
 
@@ -76,7 +76,7 @@ class HungarianMatcher(nn.Module):
         return Match(*sent_to(layers.center.device, torch.from_numpy(np.concatenate(pairs, axis=2))))
 
     def cost(self, layers: RawObjects, targets: TrueObjects) -> Tensor:
-        """Return the cost ``(..., M)`` of every query ``(...)`` with every true object, of whichever scene."""
+        """Return the cost ``(..., M)`` of every query ``(...)`` with every true object of all scenes."""
         errors = pose_errors(
             layers.center[..., None, :],
             layers.log_size[..., None, :],

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import lightning.pytorch as pl
 import torch
 from hydra.utils import instantiate
-from lightning.pytorch.callbacks import EarlyStopping, LearningRateMonitor, ModelCheckpoint, TQDMProgressBar
+from lightning.pytorch.callbacks import EarlyStopping, LearningRateMonitor, ModelCheckpoint
 from omegaconf import DictConfig, OmegaConf
 
 from raytran.checkpoints.file import BEST_NAME
@@ -22,7 +22,7 @@ from raytran.training.callbacks.last_checkpoint import BestCheckpoint, LastCheck
 from raytran.training.callbacks.run_checks import EffectiveBatch, RankAgreement, RepeatedFramesWarning
 from raytran.training.callbacks.scene_pictures import ScenePictures
 from raytran.training.callbacks.stage import StageCallback
-from raytran.training.callbacks.step_progress import StepProgress
+from raytran.training.callbacks.step_progress import LossBar, StepProgress
 from raytran.training.callbacks.telemetry import RunSettings, Telemetry
 from raytran.training.checkpoint_io import AtomicCheckpointIO
 from raytran.training.datamodule import SceneDataModule
@@ -123,7 +123,7 @@ def build_trainer(
     if run.progress_bar == "rich":
         callbacks.append(StepProgress(metadata["stage"]))
     elif run.progress_bar == "tqdm":
-        callbacks.append(TQDMProgressBar())
+        callbacks.append(LossBar())
     loggers = [instantiate(logger, _convert_="all") for logger in plain(cfg.logger).values()]
     return instantiate(
         settings,
