@@ -14,6 +14,7 @@ from raytran.backbone.block import RayTracedBlock
 from raytran.errors import ConfigError, ShapeError, check_shape
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid, ray_code, voxel_code
+from raytran.ops.norms import LayerNorm
 from raytran.ops.pairs import Pairs
 from raytran.ops.splat import splat_in_chunks
 from raytran.ops.traverse import RayTracer
@@ -228,8 +229,8 @@ class Backbone(VoxelBackbone):
             RayTracedBlock(channels=channels, num_heads=num_heads, expansion=expansion)
             for _ in range(num_blocks)
         )
-        self.voxel_norm = nn.LayerNorm(channels)
-        self.pixel_norm = nn.LayerNorm(channels)
+        self.voxel_norm = LayerNorm(channels)
+        self.pixel_norm = LayerNorm(channels)
         # Made last, so that the other parts start from the same weights with and without it.
         self.voxel_network = nn.Identity() if voxel_network is None else voxel_network(channels=channels)
 

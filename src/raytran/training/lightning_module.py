@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import lightning.pytorch as pl
@@ -15,6 +16,7 @@ from torchmetrics import MeanMetric, Metric
 from raytran.losses.total import TotalLoss
 from raytran.model import RayTran, inputs_of
 from raytran.structs import RawScene, SceneBatch
+from raytran.training.cast_weights import weights_cast_together
 from raytran.training.health_signals import gradient_norms
 from raytran.training.loggers import is_logged_step
 from raytran.training.optim import Optimization
@@ -74,10 +76,11 @@ class Reconstruction(pl.LightningModule):
             ``objects``: the last decoder layer's ``RawObjects`` without a graph; None in stages without them.
             Lightning hands all of it to the callbacks' ``on_train_batch_end``.
         """
-        raw = self._run_model(batch)
         several = torch.distributed.is_available() and torch.distributed.is_initialized()
         over_ranks = mean_over_ranks if several else None
-        losses = self._losses(raw, batch, mean_over_ranks=over_ranks)
+        with self._weights_for_a_step():
+            raw = self._run_model(batch)
+            losses = self._losses(raw, batch, mean_over_ranks=over_ranks)
         means = torch.stack([value.detach() for value in losses.values()])
         if over_ranks is not None:
             means = over_ranks(means)
@@ -149,6 +152,13 @@ class Reconstruction(pl.LightningModule):
             batch.views, grid_center=batch.grid_center, new_cameras=inputs["new_cameras"]
         )
         return run(**inputs, tasks=self.stage.tasks, traced=traced)
+
+    def _weights_for_a_step(self) -> AbstractContextManager[None]:
+        """Cast weights together, where no compiler does that and no block is computed twice."""
+        twice = getattr(self.model.backbone, "checkpoint_blocks", False)
+        if self._compiled is not None or twice:
+            return nullcontext()
+        return weights_cast_together(self.model, self.device.type)
 
     def _losses(self, raw: RawScene, batch: SceneBatch, **options: Any) -> dict[str, Tensor]:
         return self.loss(
