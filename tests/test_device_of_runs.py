@@ -106,9 +106,9 @@ VARIATIONS = {
 
 BUDGET = {
     # waits of the host, kernels launched in one step
-    "stage1": (11, 1516),
-    "stage2": (49, 4324),
-    "stage3": (27, 1745),
+    "stage1": (1, 760),
+    "stage2": (1, 1830),
+    "stage3": (1, 910),
 }
 """What a training step of the paper's network may cost: measured; to be lowered when it costs less."""
 
@@ -347,9 +347,10 @@ def test_a_step_on_the_kernels_equals_one_on_the_cpu(experiment):
     expected, expected_gradients, _ = step_on("cpu", cfg, batch)
     slots, block_pairs._SLOTS = block_pairs._SLOTS, 16  # the interpreter takes its time over unused ones
     try:
-        losses, gradients, seen = step_on(DEVICE, cfg, batch)
         with kernels_left_out():
+            step_on(DEVICE, cfg, batch)  # makes what is kept for all steps
             _, _, without = step_on(DEVICE, cfg, batch)
+        losses, gradients, seen = step_on(DEVICE, cfg, batch)
     finally:
         block_pairs._SLOTS = slots
     torch.testing.assert_close(losses, expected, atol=1e-5, rtol=1e-5)

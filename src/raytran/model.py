@@ -8,7 +8,7 @@ scene looks like from elsewhere (appendix A).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -47,11 +47,13 @@ class Traced(NamedTuple):
         grid_center: ``(B, 3)`` centres of the voxel grids, metres.
         pairs: of each chunk of views, the pixel-voxel pairs of all B scenes.
         new_pairs: those of the cameras to render; None without them.
+        fits: ``()`` bool on the device, whether no pair of the views is missing; None if none is.
     """
 
     grid_center: Tensor
     pairs: tuple[Pairs, ...]
     new_pairs: Pairs | None = None
+    fits: Tensor | None = None
 
 
 class RayTran(nn.Module):
@@ -174,15 +176,24 @@ class RayTran(nn.Module):
         grid_center: Tensor | None = None,
         views_at_once: int | None = None,
         new_cameras: Cameras | None = None,
+        wait: bool = True,
     ) -> Traced:
-        """Return what ``forward`` reads along rays; arguments and errors are its own.
+        """Return what ``forward`` reads along rays.
 
-        Of the new cameras rays are traced wherever they are given.
+        Args:
+            views: as in ``forward``, and so are the errors.
+            grid_center: as there.
+            views_at_once: as there.
+            new_cameras: as there; their rays are traced wherever they are given.
+            wait: the host may wait for the number of pairs. If not, some may be missing, see ``Traced.fits``.
         """
         center = Cameras.of(views).position.mean(dim=1) if grid_center is None else grid_center
         grid = self._grid(center)
-        pairs = [self.trace(Cameras.of(chunk), grid) for chunk in _in_chunks(views, views_at_once)]
-        return Traced(center, tuple(pairs), self._trace_new(new_cameras, grid))
+        if not wait and views_at_once is None and new_cameras is None:
+            pairs = self._trace(Cameras.of(views), grid, self.ray_tracer.without_waiting)
+            return Traced(center, (pairs,), fits=self.ray_tracer.fits)
+        of_chunks = [self.trace(Cameras.of(chunk), grid) for chunk in _in_chunks(views, views_at_once)]
+        return Traced(center, tuple(of_chunks), self._trace_new(new_cameras, grid))
 
     def _trace_new(self, cameras: Cameras | None, grid: VoxelGrid) -> Pairs | None:
         """Return the pairs that the view head reads."""
@@ -197,13 +208,16 @@ class RayTran(nn.Module):
 
     def trace(self, cameras: Cameras, grid: VoxelGrid) -> Pairs:
         """Return the pairs that the backbone reads, for cameras of leading shape ``(B, N)``."""
+        return self._trace(cameras, grid, self.ray_tracer)
+
+    def _trace(self, cameras: Cameras, grid: VoxelGrid, ray_tracer: Callable[..., Pairs]) -> Pairs:
         height, width = cameras.image_size
         stride = self.backbone.stride
         return self.backbone.trace(
             cameras,
             grid,
             (height // stride, width // stride),
-            ray_tracer=self.ray_tracer,
+            ray_tracer=ray_tracer,
             rays_per_cell=self.rays_per_cell,
         )
 

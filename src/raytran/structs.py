@@ -118,12 +118,38 @@ def cached(struct: TensorStruct, name: str, make: Callable[[], _Made]) -> _Made:
 
 def sent_to(device: torch.device, tensor: Tensor) -> Tensor:
     """Return a tensor of the CPU on ``device``, by way of page-locked memory: the host does not wait."""
-    if device.type in ("cpu", "mps"):
+    if device.type in ("cpu", "mps") or torch.compiler.is_compiling():
         return tensor.to(device)
     return tensor.pin_memory().to(device, non_blocking=True)
 
 
-_Make = TypeVar("_Make", bound=Callable[..., Tensor])
+class HostCopy:
+    """A copy of a tensor on the host, for which it waits when it is asked for, and not before.
+
+    Args:
+        tensor: on any device.
+    """
+
+    def __init__(self, tensor: Tensor) -> None:
+        self._values = tensor.to("cpu", non_blocking=True)
+        self._copied: Any = None
+        backend: Any = None if tensor.is_cpu else torch.get_device_module(tensor.device)
+        if hasattr(backend, "Event"):
+            self._copied = backend.Event()
+            self._copied.record(backend.current_stream(tensor.device))
+
+    def has_arrived(self) -> bool:
+        """Say whether ``values`` would not wait."""
+        return self._copied is None or self._copied.query()
+
+    def values(self) -> Tensor:
+        """Return the copy."""
+        if self._copied is not None:
+            self._copied.synchronize()
+        return self._values
+
+
+_Make = TypeVar("_Make", bound=Callable[..., Any])
 
 
 def kept_on_device(most: int) -> Callable[[_Make], _Make]:
@@ -138,12 +164,12 @@ def kept_on_device(most: int) -> Callable[[_Make], _Make]:
 
     def decorate(make: _Make) -> _Make:
         @lru_cache(maxsize=most)
-        def kept(*values: Any, device: torch.device) -> Tensor:
+        def kept(*values: Any, device: torch.device) -> Any:
             with torch.inference_mode(False), torch.no_grad():
                 return make(*values, device=device)
 
         @wraps(make)
-        def call(*values: Any, device: torch.device) -> Tensor:
+        def call(*values: Any, device: torch.device) -> Any:
             at_once = device.type == "cpu" or torch.compiler.is_compiling()
             return (make if at_once else kept)(*values, device=device)
 

@@ -17,7 +17,6 @@ from raytran.geometry.grid import VoxelGrid, ray_code, voxel_code
 from raytran.ops.norms import LayerNorm
 from raytran.ops.pairs import Pairs
 from raytran.ops.splat import splat_in_chunks
-from raytran.ops.traverse import RayTracer
 
 
 class ImageEncoder(nn.Module):
@@ -123,7 +122,7 @@ class VoxelBackbone(nn.Module, ABC):
         grid: VoxelGrid,
         feature_size: tuple[int, int],
         *,
-        ray_tracer: RayTracer,
+        ray_tracer: Callable[..., Pairs],
         rays_per_cell: int,
     ) -> Pairs:
         """Return the pairs of pixels and voxels that exchange features.
@@ -240,7 +239,7 @@ class Backbone(VoxelBackbone):
         grid: VoxelGrid,
         feature_size: tuple[int, int],
         *,
-        ray_tracer: RayTracer,
+        ray_tracer: Callable[..., Pairs],
         rays_per_cell: int,
     ) -> Pairs:
         """Return the pairs of pixels and voxels that exchange features: those that a ray joins."""

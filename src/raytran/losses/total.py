@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from raytran.errors import ConfigError, DataError
 from raytran.losses.matcher import HungarianMatcher
 from raytran.losses.objects import Betas, Match, TrueObjects, object_losses, pick_queries
-from raytran.structs import ObjectSet, RawObjects, RawScene, SceneBatch, Views
+from raytran.structs import ObjectSet, RawObjects, RawScene, SceneBatch, Views, constant
 
 
 def occupancy_loss(logits: Tensor, target: Tensor) -> Tensor:
@@ -169,8 +169,9 @@ class TotalLoss(nn.Module):
                 losses["view"] = view_loss(*_both("view", raw.new_views, batch.new_views))
             if "objects" in terms or "shape" in terms:
                 losses |= self._objects(raw, batch, terms, decode_shapes, mean_over_ranks)
-            weighted = [self._weight(name) * value for name, value in losses.items()]
-            losses["total"] = torch.stack(weighted).sum()
+            values = torch.stack(list(losses.values()))
+            weights = constant(tuple(map(self._weight, losses)), values.dtype, device=values.device)
+            losses["total"] = (weights * values).sum()
         return losses
 
     def _objects(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Normalisation that stays in 16 bits where its input is, under autocast."""
+"""What is in 16 bits under autocast: norms of 16-bit streams, and what several products read."""
 
 from __future__ import annotations
 
@@ -21,3 +21,9 @@ class LayerNorm(nn.LayerNorm):
             return F.layer_norm(
                 x, self.normalized_shape, self.weight.to(x.dtype), self.bias.to(x.dtype), self.eps
             )
+
+
+def in_product_dtype(x: Tensor) -> Tensor:
+    """Return ``x`` as autocast's products take it: cast once for all that read it."""
+    kind = x.device.type
+    return x.to(torch.get_autocast_dtype(kind)) if torch.is_autocast_enabled(kind) else x

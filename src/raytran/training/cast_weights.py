@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from itertools import groupby
 from typing import Any
 
 import torch
@@ -21,35 +20,47 @@ from raytran.ops.norms import LayerNorm
 _CAST = (nn.Linear, _ConvNd, nn.MultiheadAttention, LayerNorm)
 """Modules that autocast runs in 16 bits, and norms that follow their input."""
 
+_OURS = ("raytran.model", "raytran.backbone.", "raytran.heads.")
+"""Where modules leave it to autocast in which precision their parts compute; others may not."""
+
 
 @contextmanager
 def weights_cast_together(model: nn.Module, device_type: str) -> Iterator[None]:
     """Let the modules of ``model`` find 16-bit weights in this block, if autocast is on; else do nothing.
 
-    The gradients of each part, ``backbone.blocks`` or ``heads.objects``, come to the weights together.
+    The gradients of each part, encoder, backbone or heads, come to their weights together: between ranks they
+    travel while those of the parts before are computed.
     """
     if not torch.is_autocast_enabled(device_type):
         yield
         return
     dtype = torch.get_autocast_dtype(device_type)
-    places = [
-        (path, module, name)
-        for path, module in model.named_modules()
-        if isinstance(module, _CAST)
-        for name, weight in module.named_parameters(recurse=False)
-        if weight.dtype == torch.float32
-    ]
-    weights = [module._parameters[name] for _, module, name in places]
+    # Frozen weights apart: of what is cast with one that learns, gradients are computed.
+    parts: dict[tuple[str, bool], list[tuple[nn.Module, str, nn.Parameter]]] = {}
+    for path, module in _under_autocast(model, ""):
+        for name, weight in module.named_parameters(recurse=False):
+            part = "encoder" if ".encoder." in path else path.split(".")[0]
+            parts.setdefault((part, weight.requires_grad), []).append((module, name, weight))
     try:
-        for _, members in groupby(places, key=lambda place: place[0].split(".")[:2]):
-            part = [(module, name) for _, module, name in members]
-            cast = _CastTogether.apply(dtype, *(module._parameters[name] for module, name in part))
-            for (module, name), in_16_bits in zip(part, cast, strict=True):
+        for members in parts.values():
+            cast = _CastTogether.apply(dtype, *(weight for *_, weight in members))
+            for (module, name, _), in_16_bits in zip(members, cast, strict=True):
                 module._parameters[name] = in_16_bits
         yield
     finally:
-        for (_, module, name), weight in zip(places, weights, strict=True):
-            module._parameters[name] = weight
+        for members in parts.values():
+            for module, name, weight in members:
+                module._parameters[name] = weight
+
+
+def _under_autocast(owner: nn.Module, path: str) -> Iterator[tuple[str, nn.Module]]:
+    """Yield path and module of all that are cast."""
+    for name, module in owner.named_children():
+        kind = type(module).__module__
+        if kind.startswith((*_OURS, "torch.nn.", LayerNorm.__module__)):
+            if isinstance(module, _CAST):
+                yield path + name, module
+            yield from _under_autocast(module, f"{path}{name}.")
 
 
 class _CastTogether(torch.autograd.Function):

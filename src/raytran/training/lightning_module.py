@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
@@ -14,7 +15,7 @@ from torch.optim import Optimizer
 from torchmetrics import MeanMetric, Metric
 
 from raytran.losses.total import TotalLoss
-from raytran.model import RayTran, inputs_of
+from raytran.model import RayTran, Traced, inputs_of
 from raytran.structs import RawScene, SceneBatch
 from raytran.training.cast_weights import weights_cast_together
 from raytran.training.health_signals import gradient_norms
@@ -79,8 +80,13 @@ class Reconstruction(pl.LightningModule):
         several = torch.distributed.is_available() and torch.distributed.is_initialized()
         over_ranks = mean_over_ranks if several else None
         with self._weights_for_a_step():
-            raw = self._run_model(batch)
+            # A step waits for its device once: where queries are matched, and else for the number of pairs.
+            traced = self._trace(batch, wait=not {"objects", "shape"} & set(self.stage.terms))
+            raw = self._run_model(batch, traced)
             losses = self._losses(raw, batch, mean_over_ranks=over_ranks)
+        if traced.fits is not None:
+            # A step that lacks pairs is skipped, like one that is not finite.
+            losses["total"] = torch.where(traced.fits, losses["total"], math.nan)
         means = torch.stack([value.detach() for value in losses.values()])
         if over_ranks is not None:
             means = over_ranks(means)
@@ -93,7 +99,7 @@ class Reconstruction(pl.LightningModule):
 
     def validation_step(self, batch: SceneBatch, batch_idx: int) -> None:
         """Collect the losses and the scores, in float32 also under autocast."""
-        raw = self._run_model(batch)
+        raw = self._run_model(batch, self._trace(batch))
         losses = self._losses(raw, batch)
         weight = 0 if self._is_repeated(batch_idx) else len(batch.scene_id)
         for name, value in losses.items():
@@ -146,12 +152,15 @@ class Reconstruction(pl.LightningModule):
                 nn.utils.clip_grads_with_norm_(self.model.parameters(), gradient_clip_val, norm)
         self._gradient_norms = None
 
-    def _run_model(self, batch: SceneBatch) -> RawScene:
-        run, inputs = self._compiled or self.model, inputs_of(batch)
-        traced = self.model.trace_views(
-            batch.views, grid_center=batch.grid_center, new_cameras=inputs["new_cameras"]
+    def _trace(self, batch: SceneBatch, *, wait: bool = True) -> Traced:
+        new_cameras = inputs_of(batch)["new_cameras"]
+        return self.model.trace_views(
+            batch.views, grid_center=batch.grid_center, new_cameras=new_cameras, wait=wait
         )
-        return run(**inputs, tasks=self.stage.tasks, traced=traced)
+
+    def _run_model(self, batch: SceneBatch, traced: Traced | None = None) -> RawScene:
+        run = self._compiled or self.model
+        return run(**inputs_of(batch), tasks=self.stage.tasks, traced=traced)
 
     def _weights_for_a_step(self) -> AbstractContextManager[None]:
         """Cast weights together, where no compiler does that and no block is computed twice."""

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from raytran.errors import NonFiniteError
-from raytran.structs import RawObjects, SceneBatch
+from raytran.structs import HostCopy, RawObjects, SceneBatch
 from raytran.training.health_signals import RunningStatistics, slot_signals
 from raytran.training.lightning_module import Reconstruction
 from raytran.training.loggers import was_logged_step
@@ -26,37 +26,37 @@ _log = logging.getLogger(__name__)
 
 @dataclass
 class _Step:
-    """What is known of a step, before and after its numbers have come to the host.
+    """What is known of a step.
 
     Attributes:
         number: of the step.
         parts: whose gradients have norms.
-        values: on the host, the loss and these norms; that they are there only ``arrived`` says.
-        arrived: what the device comes to behind the copy to ``values``; None where the host has waited.
+        found: the loss and these norms.
         losses: terms of the loss of each of its batches.
     """
 
     number: int
     parts: Sequence[str]
-    values: Tensor
-    arrived: Any
+    found: HostCopy
     losses: list[Mapping[str, Tensor]] = field(default_factory=list)
 
     def norms(self) -> dict[str, float]:
         """Return the norms of the gradients by part."""
-        return dict(zip(self.parts, self.values.tolist()[1:], strict=True))
+        return dict(zip(self.parts, self.found.values().tolist()[1:], strict=True))
 
     def is_finite(self) -> bool:
         """Say whether the loss and all gradients are finite."""
-        return all(map(math.isfinite, self.values.tolist()))
+        return all(map(math.isfinite, self.found.values().tolist()))
 
     def reason(self) -> str:
         """Say which terms of the loss are not finite, or else which gradients."""
         terms = {
             name for losses in self.losses for name, value in losses.items() if not value.isfinite().all()
         }
+        if terms == {"total"}:
+            return "the loss, or more pairs of pixels and voxels than twice those of any step before"
         if terms:
-            return f"the loss ({', '.join(sorted(terms - {'total'})) or 'total'})"
+            return f"the loss ({', '.join(sorted(terms - {'total'}))})"
         parts = [part for part, norm in self.norms().items() if part != "all" and not math.isfinite(norm)]
         return f"the gradient of {', '.join(parts)}"
 
@@ -120,18 +120,13 @@ class Health(pl.Callback):
         self._loss = None
         norms = pl_module.gradient_norms()
         values = torch.stack([loss, *norms.values()])
+        self._step = _Step(trainer.global_step, list(norms), HostCopy(values))
         if optimizer.defaults["fused"]:
             is_bad = (0.0 * values).sum().isnan()
             vars(optimizer)["found_inf"] = is_bad.float()
             if self._statistics is not None:
                 self._statistics.restore(where=is_bad)
-            home = values.to("cpu", non_blocking=True)
-            self._step = _Step(trainer.global_step, list(norms), home, _event_now(values.device))
-            return
-        self._step = _Step(
-            trainer.global_step, list(norms), values.cpu(), None
-        )  # a step's wait for the device
-        if not self._step.is_finite():
+        elif not self._step.is_finite():  # here the host waits
             optimizer.zero_grad(set_to_none=True)  # parameters without gradients are left as they are
             if self._statistics is not None:
                 self._statistics.restore()
@@ -150,7 +145,7 @@ class Health(pl.Callback):
         self._read(trainer)
         self._step.losses, self._losses = self._losses, []
         step, self._unread = self._step, self._step
-        if was_logged_step(trainer) or step.arrived is None:
+        if was_logged_step(trainer) or not trainer.optimizers[0].defaults["fused"]:
             self._read(trainer)
         if was_logged_step(trainer):
             pl_module.log_dict(self._signals(pl_module, step, outputs["objects"], batch))
@@ -168,8 +163,6 @@ class Health(pl.Callback):
         step, self._unread = self._unread, None
         if step is None:
             return
-        if step.arrived is not None:
-            step.arrived.synchronize()
         if step.is_finite():
             self._in_a_row = 0
             return
@@ -208,13 +201,3 @@ class Health(pl.Callback):
             f"{self._in_a_row} steps in a row were not finite, the last one step {step} ({reason}): lower "
             f"optimizer.learning_rate,{remedy} and go on from a checkpoint before that"
         )
-
-
-def _event_now(device: torch.device) -> Any:
-    """Return an event that comes when the device has done all that it was given; None without events."""
-    backend = torch.get_device_module(device)
-    if not hasattr(backend, "Event"):
-        return None
-    event = backend.Event()
-    event.record(backend.current_stream(device))
-    return event
