@@ -275,7 +275,7 @@ class RayTracer:
     ) -> Pairs:
         """Return the pairs without waiting for their number: there is room for twice the most so far.
 
-        ``fits``, ``()`` bool on the device, then says whether that sufficed. If not, the last ones are missing
+        ``fits``, ``()`` bool on the device, then says whether that sufficed. If not, the last are missing
         and nothing may be learned from the rest. It is None where all are there for certain: without kernels,
         or when such rays are traced for the first time, for which the host waits.
         """

@@ -16,7 +16,7 @@ from raytran.checkpoints.file import BEST_NAME
 from raytran.checkpoints.network import without_sources
 from raytran.checkpoints.runs import LAST
 from raytran.errors import ConfigError
-from raytran.run.train.settings import RunConfig
+from raytran.run.train.settings import RunConfig, does_compile
 from raytran.training.callbacks.health import Health
 from raytran.training.callbacks.last_checkpoint import BestCheckpoint, LastCheckpoint
 from raytran.training.callbacks.run_checks import EffectiveBatch, RankAgreement, RepeatedFramesWarning
@@ -60,7 +60,7 @@ def build_module(cfg: DictConfig, model: RayTran) -> Reconstruction:
         loss=instantiate(cfg.loss, _convert_="all"),
         stage=instantiate(cfg.stage, _convert_="all"),
         optimization=instantiate(cfg.optimizer, _convert_="all"),
-        compiled=cfg.compile,
+        compiled=does_compile(cfg.compile),
         metrics=instantiate(cfg.get("metrics", {}), _convert_="all"),
     )
 
