@@ -8,6 +8,7 @@ its callbacks; it trains under autocast in bfloat16, as on a GPU.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 from dataclasses import replace
 from unittest.mock import patch
@@ -300,6 +301,29 @@ def test_steps_that_are_not_finite_change_nothing(tmp_path):
         fit(trainer_of(cfg, tmp_path, steps=1), module, [scene_with(targets_of(module.stage))])
     for name, value in module.state_dict().items():
         assert torch.equal(value.cpu(), before[name]), f"{name} has changed in a step that was skipped"
+
+
+@on_pretend_device
+def test_a_step_that_lacks_pairs_changes_nothing(tmp_path):
+    """There is room for twice the pairs of all steps before; what is computed with fewer is not learned."""
+    cfg = configured("stage2", "tiny", "watch.pictures=0", "schedule.log_every=1")
+    module, states = module_of(cfg), []
+
+    class After(pl.Callback):
+        def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
+            states.append({name: value.cpu().clone() for name, value in pl_module.state_dict().items()})
+            if batch_idx == 0:
+                most = pl_module.model.ray_tracer._most
+                most.update(dict.fromkeys(most, 1))
+
+    trainer = trainer_of(cfg, tmp_path, steps=3, callbacks=[After()])
+    fit(trainer, module, [scene_with(targets_of(module.stage))] * 3)
+    same = [
+        all(torch.equal(value, after[name]) for name, value in before.items())
+        for before, after in itertools.pairwise(states)
+    ]
+    assert same == [True, False]
+    assert trainer.callback_metrics["health/skipped_steps"] == 1
 
 
 @pytest.mark.parametrize("experiment", BUDGET)

@@ -288,8 +288,8 @@ class Backbone(VoxelBackbone):
 
     def _voxel_positions(self, grid: VoxelGrid) -> Tensor:
         """Return the position embedding of the voxels, ``(X, Y, Z, C)``; that of every scene is the same."""
-        bias, shape = self.voxel_position.bias, (grid.resolution, grid.extent)
-        code = voxel_code(*shape, grid.extent, self.channels, bias.dtype, device=bias.device)
+        like, shape = self.unseen, (grid.resolution, grid.extent)  # of the projection there may be 16 bits
+        code = voxel_code(*shape, grid.extent, self.channels, like.dtype, device=like.device)
         return self.voxel_position(code)
 
     def _updates_pixels(self, index: int, *, with_pixels: bool) -> bool:
