@@ -131,9 +131,10 @@ class HostCopy:
     """
 
     def __init__(self, tensor: Tensor) -> None:
-        self._values = tensor.to("cpu", non_blocking=True)
+        waits = tensor.device.type in ("cpu", "mps")
+        self._values = tensor.to("cpu", non_blocking=not waits)
         self._copied: Any = None
-        backend: Any = None if tensor.is_cpu else torch.get_device_module(tensor.device)
+        backend: Any = None if waits else torch.get_device_module(tensor.device)
         if hasattr(backend, "Event"):
             self._copied = backend.Event()
             self._copied.record(backend.current_stream(tensor.device))

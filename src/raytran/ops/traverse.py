@@ -34,6 +34,9 @@ _PARALLEL = 1e-12
 _VIEWS_AT_ONCE = 8
 """Views that are counted together."""
 
+_LEAST_ROOM = 256
+"""Block pairs for which there is always room."""
+
 _AT_ONCE = {"cpu": 1 << 18}
 _AT_ONCE_ELSEWHERE = 1 << 23
 """Crossings looked at together: on a CPU so few that they stay in its cache."""
@@ -287,7 +290,7 @@ class RayTracer:
             return self(cameras, grid, feature_size, rays_per_cell)
         from raytran.ops.triton.traverse import trace_blocks
 
-        room = 2 * self._most[kind]
+        room = max(2 * self._most[kind], _LEAST_ROOM)
         pairs, found = trace_blocks(cameras, grid, feature_size, rays_per_cell, capacity=room)
         self.fits = found <= room
         self._coming.append((kind, HostCopy(found)))

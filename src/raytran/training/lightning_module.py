@@ -82,7 +82,7 @@ class Reconstruction(pl.LightningModule):
         with self._weights_for_a_step():
             # A step waits for its device once: where queries are matched, and else for the number of pairs.
             traced = self._trace(batch, wait=not {"objects", "shape"} & set(self.stage.terms))
-            raw = self._run_model(batch, traced)
+            raw = self._run_model(batch, traced._replace(fits=None))
             losses = self._losses(raw, batch, mean_over_ranks=over_ranks)
         if traced.fits is not None:
             # A step that lacks pairs is skipped, like one that is not finite.
@@ -144,9 +144,9 @@ class Reconstruction(pl.LightningModule):
         """
         if gradient_clip_algorithm not in (None, "norm"):
             self.clip_gradients(optimizer, gradient_clip_val, gradient_clip_algorithm)
-        elif gradient_clip_val:
+        elif gradient_clip_val and self.gradient_norms():
             norm = self.gradient_norms()["all"]
-            if optimizer.defaults["fused"]:
+            if optimizer.defaults.get("fused"):
                 vars(optimizer)["grad_scale"] = ((norm + 1e-6) / gradient_clip_val).clamp(min=1.0)
             else:
                 nn.utils.clip_grads_with_norm_(self.model.parameters(), gradient_clip_val, norm)

@@ -9,6 +9,7 @@ import torch
 from raytran.errors import ConfigError, ShapeError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
+from raytran.ops import traverse
 from raytran.ops.pairs import PairList
 from raytran.ops.traverse import RayTracer, trace_pairs
 from raytran.ops.triton.block_pairs import BlockPairs
@@ -133,8 +134,9 @@ def test_every_pair_is_there_however_many_the_step_before_had(random_cameras):
         assert len(tracer(*here, (4, 16), 1).index()[0]) == len(exact)
 
 
-def test_pairs_may_be_traced_without_waiting_for_their_number(random_cameras):
+def test_pairs_may_be_traced_without_waiting_for_their_number(random_cameras, monkeypatch):
     """The first ones are waited for; then there is room for twice the most, and it is heard if that lacks."""
+    monkeypatch.setattr(traverse, "_LEAST_ROOM", 0)
     grid = VoxelGrid((8, 8, 8), (3.0, 3.0, 3.0), torch.zeros(3, dtype=torch.float64))
     rays = (*_on_device(random_cameras(1, spread=0.1), grid), (4, 16), 1)
     tracer = RayTracer("fused")

@@ -121,7 +121,7 @@ class Health(pl.Callback):
         norms = pl_module.gradient_norms()
         values = torch.stack([loss, *norms.values()])
         self._step = _Step(trainer.global_step, list(norms), HostCopy(values))
-        if optimizer.defaults["fused"]:
+        if optimizer.defaults.get("fused"):
             is_bad = (0.0 * values).sum().isnan()
             vars(optimizer)["found_inf"] = is_bad.float()
             if self._statistics is not None:
@@ -145,7 +145,7 @@ class Health(pl.Callback):
         self._read(trainer)
         self._step.losses, self._losses = self._losses, []
         step, self._unread = self._step, self._step
-        if was_logged_step(trainer) or not trainer.optimizers[0].defaults["fused"]:
+        if was_logged_step(trainer) or not trainer.optimizers[0].defaults.get("fused"):
             self._read(trainer)
         if was_logged_step(trainer):
             pl_module.log_dict(self._signals(pl_module, step, outputs["objects"], batch))
