@@ -90,7 +90,7 @@ _NO_LAUNCH = {
     *("empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided", "resize_"),
 }
 _TENSORS_A_LAUNCH = 30
-"""Tensors that one launch of a ``_foreach`` operation takes; on CUDA between 30 and 110."""
+"""Tensors that one launch of a ``_foreach`` or fused operation takes; on CUDA between 30 and 110."""
 
 _ATTENTION_BACKWARD = 3
 """Kernels in which flash attention computes its gradients; forward it is one."""
@@ -131,6 +131,7 @@ class Ledger:
 
 
 _ledger = Ledger()
+_waits_so_far = 0
 _stand_ins: dict[str, Callable[..., Any]] = {}
 _traced: dict[Any, tuple[Any, Ledger]] = {}
 _libraries: list[torch.library.Library] = []
@@ -159,7 +160,8 @@ def kernels_left_out() -> Iterator[None]:
 
     trace = trace_blocks.trace_blocks
 
-    def trace_once(cameras: Any, grid: Any, *rest: Any) -> Any:
+    def trace_once(cameras: Any, grid: Any, *rest: Any, capacity: int | None = None) -> Any:
+        global _waits_so_far
         tensors = _inside([cameras.intrinsics, cameras.world_from_camera, grid.center])
         known = (
             str([tensor.tolist() for tensor in tensors]),
@@ -167,11 +169,14 @@ def kernels_left_out() -> Iterator[None]:
             grid.resolution,
             grid.extent,
             rest,
+            capacity,
         )
         if known not in _traced:
+            trace(cameras, grid, *rest, capacity=capacity)  # makes what is kept for all others
             with recorded() as seen:
-                _traced[known] = trace(cameras, grid, *rest), seen
+                _traced[known] = trace(cameras, grid, *rest, capacity=capacity), seen
         (pairs, number), seen = _traced[known]
+        _waits_so_far += seen.waits.total()
         _ledger.waits.update(seen.waits)
         _ledger.launches.update(seen.launches)
         return replace(pairs), number  # a copy, so that the orders of the pairs are made anew
@@ -282,14 +287,14 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     _check_devices(func, args, list(_tensors((args, kwargs))))
     reason = _wait_of(func, args, kwargs)
     if reason is not None:
-        _ledger.waits[f"{reason} at {_place()}"] += 1
+        _wait(reason)
     run = func
     if func.namespace == "raytran":  # its kernels are counted where they are launched
         if form.name in _stand_ins:
             run = _stand_ins[form.name]
             _ledger.launches[form.name] += _KERNELS[form.name]
     elif form.launches:
-        at_once = _TENSORS_A_LAUNCH if form.name.startswith("_foreach") else None
+        at_once = _TENSORS_A_LAUNCH if form.name.startswith(("_foreach", "_fused")) else None
         _ledger.launches[form.name] += -(-len(args[0]) // at_once) if at_once else 1
     kwargs_inside = {key: _inside(value) for key, value in kwargs.items()}
     if device is not None:
@@ -304,6 +309,12 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         for value, place in zip(found if len(form.changed) > 1 else [found], form.changed, strict=False)
     ]
     return tuple(results) if len(results) > 1 else results[0] if results else None
+
+
+def _wait(reason: str) -> None:
+    global _waits_so_far
+    _waits_so_far += 1
+    _ledger.waits[f"{reason} at {_place()}"] += 1
 
 
 def _check_devices(func: Any, args: Any, tensors: list[Tensor]) -> None:
@@ -468,6 +479,22 @@ class _Backend(backend_registration._DummyBackendModule):
 
     def set_rng_state(self, state: Tensor, device: Any = None) -> None:
         torch.set_rng_state(state)
+
+    def current_stream(self, device: Any = None) -> None:
+        """Return the one stream that there is."""
+
+    class Event:
+        """What the device comes to when it has done all before: waited for, unless it was since."""
+
+        def record(self, stream: None) -> None:
+            self._waits = _waits_so_far
+
+        def query(self) -> bool:
+            return self._waits < _waits_so_far
+
+        def synchronize(self) -> None:
+            if not self.query():
+                _wait("an event")
 
 
 def set_up() -> None:

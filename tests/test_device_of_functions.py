@@ -183,10 +183,8 @@ SOME_FOLDERS = ("geometry", "ops", "backbone", "heads", "extensions", "losses")
 COPIES = {
     "geometry/box_clip.py": {"_face_edges", "_crossings", "_clamped_flux"},
     "geometry/boxes.py": {"corners"},
-    "geometry/grid.py": {"position_code"},
     "geometry/rotation.py": {"upright_basis"},
     "geometry/room_tiles.py": {"_offset", "corner_index"},
-    "losses/matcher.py": {"_match"},
     "ops/traverse.py": {"_clip"},
 }
 """Functions that copy Python's numbers to the device, for which the host waits: not to be added to."""

@@ -37,7 +37,7 @@ def training_steps(context: Context) -> None:
                 passed = count <= MOST_WAITS
                 context.checks.add(name, bar=bar, measured=str(count), passed=passed, notes=places)
             else:
-                # The callback Health reads the losses in every step.
+                # For the matching's costs, or for the number of pairs.
                 context.checks.add(name, bar=bar, why="none was seen, not even the one that must be there")
             launches, most = steps.launches, f"≤ {MOST_LAUNCHES:,}" if stage == "stage2" else ""
             name = f"kernels launched in a step of {stage}"

@@ -8,9 +8,9 @@ scene looks like from elsewhere (appendix A).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -40,6 +40,22 @@ def inputs_of(batch: SceneBatch) -> dict[str, Any]:
         "true_objects": batch.objects,
         "new_cameras": None if batch.new_views is None else Cameras.of(batch.new_views),
     }
+
+
+class Traced(NamedTuple):
+    """Where ``forward`` looks along rays: made before the network runs, which is then one graph of tensors.
+
+    Attributes:
+        grid_center: ``(B, 3)`` centres of the voxel grids, metres.
+        pairs: of each chunk of views, the pixel-voxel pairs of all B scenes.
+        new_pairs: those of the cameras to render; None without them.
+        fits: ``()`` bool on the device, whether no pair of the views is missing; None if none is.
+    """
+
+    grid_center: Tensor
+    pairs: tuple[Pairs, ...]
+    new_pairs: Pairs | None = None
+    fits: Tensor | None = None
 
 
 class RayTran(nn.Module):
@@ -92,6 +108,7 @@ class RayTran(nn.Module):
         views_at_once: int | None = None,
         new_cameras: Cameras | None = None,
         true_objects: Sequence[ObjectSet] | None = None,
+        traced: Traced | None = None,
     ) -> RawScene:
         """Run the backbone once and the heads of ``tasks``.
 
@@ -104,6 +121,8 @@ class RayTran(nn.Module):
             new_cameras: what ``view`` renders, of leading shape ``(B, V)``; no other task sees them.
             true_objects: of the scenes, for object heads that learn from noisy copies of them in training; no
                 other prediction depends on them.
+            traced: what ``trace_views`` returned for the same views; None: they are traced here. Given, the
+                network is one graph for ``torch.compile``.
 
         Returns:
             Raw predictions, None for what was not asked for.
@@ -114,45 +133,93 @@ class RayTran(nn.Module):
             ShapeError: image sides are not divisible by the encoder's stride, or tensors do not have the
                 documented shapes.
         """
-        center = Cameras.of(views).position.mean(dim=1) if grid_center is None else grid_center
-        grid = VoxelGrid(self.grid_resolution, self.grid_extent, center)
-        voxels, pixels = self._run_backbone(views, grid, "foreground" in tasks, views_at_once)
+        if traced is None:
+            rendered = new_cameras if "view" in tasks else None
+            traced = self.trace_views(
+                views, grid_center=grid_center, views_at_once=views_at_once, new_cameras=rendered
+            )
+        voxels, pixels = self._run_backbone(views, traced, "foreground" in tasks, views_at_once)
         objects = ObjectOutputs(())
         if "objects" in tasks:
-            objects = self.heads["objects"](voxels, grid, true_objects)
+            objects = self.heads["objects"](voxels, self._grid(traced.grid_center), true_objects)
         return RawScene(
-            grid_center=center,
+            grid_center=traced.grid_center,
             occupancy=self.heads["occupancy"](voxels) if "occupancy" in tasks else None,
             foreground=None if pixels is None else self._foreground(pixels),
             objects=objects.layers or None,
             proposals=objects.proposals,
             denoising=objects.denoising,
-            new_views=self._render(voxels, grid, new_cameras) if "view" in tasks else None,
+            new_views=self._render(voxels, traced, new_cameras) if "view" in tasks else None,
             voxels=voxels,
         )
 
+    def _grid(self, center: Tensor) -> VoxelGrid:
+        return VoxelGrid(self.grid_resolution, self.grid_extent, center)
+
     def _run_backbone(
-        self, views: Views, grid: VoxelGrid, with_pixels: bool, views_at_once: int | None
+        self, views: Views, traced: Traced, with_pixels: bool, views_at_once: int | None
     ) -> tuple[Tensor, list[Tensor] | None]:
         """Return voxel features, and the pixel features of each chunk of views if they are wanted."""
         chunks = _in_chunks(views, views_at_once)
-        cameras = [Cameras.of(chunk) for chunk in chunks]
-        pairs = [self.trace(of_chunk, grid) for of_chunk in cameras]
         # Nothing but a prediction has several chunks, and they have no gradient.
         with torch.set_grad_enabled(torch.is_grad_enabled() and len(chunks) == 1):
             return self.backbone(
-                [chunk.images for chunk in chunks], cameras, grid, pairs, with_pixels=with_pixels
+                [chunk.images for chunk in chunks],
+                [Cameras.of(chunk) for chunk in chunks],
+                self._grid(traced.grid_center),
+                traced.pairs,
+                with_pixels=with_pixels,
             )
+
+    def trace_views(
+        self,
+        views: Views,
+        *,
+        grid_center: Tensor | None = None,
+        views_at_once: int | None = None,
+        new_cameras: Cameras | None = None,
+        wait: bool = True,
+    ) -> Traced:
+        """Return what ``forward`` reads along rays.
+
+        Args:
+            views: as in ``forward``, and so are the errors.
+            grid_center: as there.
+            views_at_once: as there.
+            new_cameras: as there; their rays are traced wherever they are given.
+            wait: the host may wait for the number of pairs. If not, some may be missing, see ``Traced.fits``.
+        """
+        center = Cameras.of(views).position.mean(dim=1) if grid_center is None else grid_center
+        grid = self._grid(center)
+        if not wait and views_at_once is None and new_cameras is None:
+            pairs = self._trace(Cameras.of(views), grid, self.ray_tracer.without_waiting)
+            return Traced(center, (pairs,), fits=self.ray_tracer.fits)
+        of_chunks = [self.trace(Cameras.of(chunk), grid) for chunk in _in_chunks(views, views_at_once)]
+        return Traced(center, tuple(of_chunks), self._trace_new(new_cameras, grid))
+
+    def _trace_new(self, cameras: Cameras | None, grid: VoxelGrid) -> Pairs | None:
+        """Return the pairs that the view head reads."""
+        if cameras is None:
+            return None
+        stride = self.backbone.stride
+        height, width = cameras.image_size
+        if height % stride or width % stride:
+            raise ShapeError(f"expected new cameras with sides divisible by {stride}, got {height}x{width}")
+        # Along the rays, also where the backbone reads its features in another way.
+        return self.ray_tracer(cameras, grid, (height // stride, width // stride), self.rays_per_cell)
 
     def trace(self, cameras: Cameras, grid: VoxelGrid) -> Pairs:
         """Return the pairs that the backbone reads, for cameras of leading shape ``(B, N)``."""
+        return self._trace(cameras, grid, self.ray_tracer)
+
+    def _trace(self, cameras: Cameras, grid: VoxelGrid, ray_tracer: Callable[..., Pairs]) -> Pairs:
         height, width = cameras.image_size
         stride = self.backbone.stride
         return self.backbone.trace(
             cameras,
             grid,
             (height // stride, width // stride),
-            ray_tracer=self.ray_tracer,
+            ray_tracer=ray_tracer,
             rays_per_cell=self.rays_per_cell,
         )
 
@@ -160,18 +227,12 @@ class RayTran(nn.Module):
         logits = [self.heads["foreground"](chunk) for chunk in pixels]
         return logits[0] if len(logits) == 1 else torch.cat(logits, dim=1)
 
-    def _render(self, voxels: Tensor, grid: VoxelGrid, cameras: Cameras | None) -> Tensor:
+    def _render(self, voxels: Tensor, traced: Traced, cameras: Cameras | None) -> Tensor:
         """Run the view head."""
-        if "view" not in self.heads or cameras is None:
+        if "view" not in self.heads or cameras is None or traced.new_pairs is None:
             missing = "new_cameras" if "view" in self.heads else "a view head: train experiment=novel_view"
             raise ConfigError(f"rendering new views needs {missing}")
-        stride = self.backbone.stride
-        height, width = cameras.image_size
-        if height % stride or width % stride:
-            raise ShapeError(f"expected new cameras with sides divisible by {stride}, got {height}x{width}")
-        # Along the rays, also where the backbone reads its features in another way.
-        pairs = self.ray_tracer(cameras, grid, (height // stride, width // stride), self.rays_per_cell)
-        return self.heads["view"](voxels, cameras, grid, pairs)
+        return self.heads["view"](voxels, cameras, self._grid(traced.grid_center), traced.new_pairs)
 
     def decode_shapes(self, embedding: Tensor) -> Tensor:
         """Return shape logits ``(M, S, S, S)`` of query embeddings ``(M, C)``."""
@@ -253,13 +314,14 @@ class RayTran(nn.Module):
         """
         self.eval()
         views = self._checked(views, grid_center, check)
-        center = Cameras.of(views).position.mean(dim=1) if grid_center is None else grid_center[None].float()
-        grid = VoxelGrid(self.grid_resolution, self.grid_extent, center)
-        voxels, _ = self._run_backbone(views, grid, False, views_at_once)
-        count = cameras.intrinsics.shape[1]
+        center = None if grid_center is None else grid_center[None].float()
+        traced = self.trace_views(views, grid_center=center, views_at_once=views_at_once)
+        voxels, _ = self._run_backbone(views, traced, False, views_at_once)
+        grid, count = self._grid(traced.grid_center), cameras.intrinsics.shape[1]
         for start in range(0, count, views_at_once or max(count, 1)):
             chunk = cameras.select(slice(start, start + (views_at_once or count)))
-            yield self._render(voxels, grid, chunk)[0].float().sigmoid()
+            along = traced._replace(new_pairs=self._trace_new(chunk, grid))
+            yield self._render(voxels, along, chunk)[0].float().sigmoid()
 
     @torch.no_grad()
     def decode(

@@ -17,9 +17,10 @@ Units, frames and signs are in ``CONVENTIONS.md``.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from functools import lru_cache, wraps
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
@@ -113,6 +114,75 @@ def cached(struct: TensorStruct, name: str, make: Callable[[], _Made]) -> _Made:
     if not hasattr(struct, name):
         object.__setattr__(struct, name, make())
     return getattr(struct, name)
+
+
+def sent_to(device: torch.device, tensor: Tensor) -> Tensor:
+    """Return a tensor of the CPU on ``device``, by way of page-locked memory: the host does not wait."""
+    if device.type in ("cpu", "mps") or torch.compiler.is_compiling():
+        return tensor.to(device)
+    return tensor.pin_memory().to(device, non_blocking=True)
+
+
+class HostCopy:
+    """A copy of a tensor on the host, for which it waits when it is asked for, and not before.
+
+    Args:
+        tensor: on any device.
+    """
+
+    def __init__(self, tensor: Tensor) -> None:
+        waits = tensor.device.type in ("cpu", "mps")
+        self._values = tensor.to("cpu", non_blocking=not waits)
+        self._copied: Any = None
+        backend: Any = None if waits else torch.get_device_module(tensor.device)
+        if hasattr(backend, "Event"):
+            self._copied = backend.Event()
+            self._copied.record(backend.current_stream(tensor.device))
+
+    def has_arrived(self) -> bool:
+        """Say whether ``values`` would not wait."""
+        return self._copied is None or self._copied.query()
+
+    def values(self) -> Tensor:
+        """Return the copy."""
+        if self._copied is not None:
+            self._copied.synchronize()
+        return self._values
+
+
+_Make = TypeVar("_Make", bound=Callable[..., Any])
+
+
+def kept_on_device(most: int) -> Callable[[_Make], _Make]:
+    """Let a function of plain values and ``device`` make its tensor once for each of them, not in every step.
+
+    On the CPU and in compiled code it is made anew: there it costs little, and may be a tensor without data.
+    Nobody may change what is kept.
+
+    Args:
+        most: results to keep.
+    """
+
+    def decorate(make: _Make) -> _Make:
+        @lru_cache(maxsize=most)
+        def kept(*values: Any, device: torch.device) -> Any:
+            with torch.inference_mode(False), torch.no_grad():
+                return make(*values, device=device)
+
+        @wraps(make)
+        def call(*values: Any, device: torch.device) -> Any:
+            at_once = device.type == "cpu" or torch.compiler.is_compiling()
+            return (make if at_once else kept)(*values, device=device)
+
+        return cast("_Make", call)
+
+    return decorate
+
+
+@kept_on_device(64)
+def constant(values: tuple[float, ...], dtype: torch.dtype, *, device: torch.device) -> Tensor:
+    """Return fixed numbers as a vector, for which the host never waits."""
+    return sent_to(device, torch.tensor(values, dtype=dtype))
 
 
 @dataclass(frozen=True)
@@ -308,6 +378,13 @@ class RawObjects(TensorStruct):
         """Return the predictions in float32, but for the embedding: it goes back into the network."""
         exact = {f.name: getattr(self, f.name).float() for f in fields(self) if f.name != "embedding"}
         return replace(self, **exact)
+
+    @staticmethod
+    def stack(layers: Sequence[RawObjects]) -> RawObjects:
+        """Return layers as one, ``(L, B, Q, ...)``."""
+        return RawObjects(
+            *(torch.stack([getattr(one, f.name) for one in layers]) for f in fields(RawObjects))
+        )
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ import torch
 
 from raytran.errors import ConfigError
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.losses.objects import Betas, Match, object_losses, pose_errors, yaw_from_vector
-from raytran.structs import ObjectSet
+from raytran.losses.objects import Betas, Match, TrueObjects, object_losses, pose_errors, yaw_from_vector
+from raytran.structs import ObjectSet, RawObjects
 
 
 def one_object(*, yaw: float = 0.0, symmetry: int = 1) -> ObjectSet:
@@ -30,7 +30,7 @@ def errors(
         target.center + torch.tensor([shift, 0.0, 0.0]),
         (target.size * torch.tensor([ratio, 1.0, 1.0])).log(),
         3.0 * torch.tensor([[math.sin(yaw), math.cos(yaw)]]),
-        target,
+        TrueObjects.of(target),
         Betas() if betas is None else betas,
     )
     return {name: float(value) for name, value in found.items()}
@@ -110,12 +110,12 @@ def test_padding_is_weighted(make_objects, make_perfect, no_object_weight: float
     """Uniform logits cost log 10 whatever the weights; a wrong padding slot counts by its weight."""
     objects, slots = make_objects(1), torch.tensor([0])
     raw = make_perfect(objects, slots, 3)
-    match = [Match(slots, torch.tensor([0]))]
+    match = Match(slots[None], torch.tensor([[0]]))
 
     def class_loss() -> float:
         found = object_losses(
-            raw,
-            [objects],
+            RawObjects.stack([raw]),
+            TrueObjects.of(objects),
             match,
             num_objects=torch.tensor(1.0),
             class_weight=torch.tensor(1 + 2 * no_object_weight),

@@ -15,6 +15,7 @@ from raytran.extensions.windowed_attention import WindowedAttention
 from raytran.geometry.grid import VoxelGrid
 from raytran.heads.objects import ObjectHead
 from raytran.losses.matcher import HungarianMatcher
+from raytran.losses.objects import TrueObjects
 from raytran.losses.total import TotalLoss
 from raytran.structs import PADDING, ObjectSet, RawObjects, RawProposals, RawScene, SceneBatch, Views
 
@@ -79,8 +80,9 @@ def test_class_term_is_the_weighted_mean_over_all_slots(padding, make_objects) -
     matcher = HungarianMatcher(weights=WEIGHTS)
     loss = TotalLoss(weights=WEIGHTS, matcher=matcher, no_object_weight=padding)
     label = torch.full((2, 5), PADDING)
-    for scene, match in enumerate(matcher(raw, scenes)):
-        label[scene, match.query] = scenes[scene].label[match.target]
+    true = TrueObjects.of(*scenes)
+    match = matcher(RawObjects.stack([raw]), true, [len(objects) for objects in scenes])
+    label.view(-1)[match.query[0]] = true.label[match.target[0]]
     weight = torch.ones(PADDING + 1)
     weight[PADDING] = padding
     expected = torch.nn.functional.cross_entropy(

@@ -62,4 +62,7 @@ def test_gradients_are_summed_by_part() -> None:
     )
     model["backbone"].weight.grad = torch.tensor([[3.0, 0.0]])
     model["backbone"].bias.grad = torch.tensor([4.0])
-    assert {name: float(norm) for name, norm in gradient_norms(model).items()} == {"backbone": 5.0}
+    assert {name: float(norm) for name, norm in gradient_norms(model).items()} == {
+        "backbone": 5.0,
+        "all": 5.0,
+    }

@@ -47,3 +47,37 @@ def test_state_is_plain_python():
     values = [value for key, value in state.items() if key != "lr_lambdas"]
     assert all(isinstance(value, plain) for value in values)
     assert state["lr_lambdas"] == [{}] or state["lr_lambdas"] == [None]
+
+
+@pytest.mark.parametrize("fused", [False, True])
+def test_a_state_is_loaded_by_an_optimiser_that_is_fused_or_not_as_it_was_made(fused):
+    """A run may go on on a CPU that began on a GPU, and the other way round."""
+    optimizers = []
+    for was_fused in (not fused, fused):
+        weight = torch.nn.Parameter(torch.ones(3))
+        optimizers.append(Optimization().build([weight], total_steps=10, fused=was_fused)["optimizer"])
+        weight.grad = torch.tensor([1.0, -2.0, 0.5])
+    optimizers[0].step()
+    optimizers[1].load_state_dict(optimizers[0].state_dict())
+    assert optimizers[1].param_groups[0]["fused"] == fused
+    for optimizer in optimizers:
+        (optimizer.param_groups[0]["params"][0]).data.fill_(1.0)
+        optimizer.step()
+    first, second = (optimizer.param_groups[0]["params"][0] for optimizer in optimizers)
+    torch.testing.assert_close(first, second)
+
+
+def test_a_fused_optimiser_skips_and_clips_by_itself():
+    moved = []
+    for found_inf, scale in ((0.0, 1.0), (1.0, 1.0), (0.0, 4.0)):
+        weight = torch.nn.Parameter(torch.ones(2))
+        optimizer = Optimization().build([weight], total_steps=10, fused=True)["optimizer"]
+        weight.grad = torch.tensor([2.0, -4.0])
+        optimizer.found_inf, optimizer.grad_scale = torch.tensor(found_inf), torch.tensor(scale)
+        optimizer.step()
+        moved.append((weight.detach().clone(), optimizer.state[weight]["exp_avg"].clone()))
+    (plain, moment), (skipped, unmoved), (_, scaled) = moved
+    assert not torch.equal(plain, torch.ones(2))
+    assert torch.equal(skipped, torch.ones(2))
+    assert not unmoved.any()
+    torch.testing.assert_close(4 * scaled, moment)

@@ -13,10 +13,10 @@ from torch.utils.checkpoint import checkpoint
 from raytran.backbone.block import RayTracedBlock
 from raytran.errors import ConfigError, ShapeError, check_shape
 from raytran.geometry.camera import Cameras
-from raytran.geometry.grid import VoxelGrid, position_code, ray_code
+from raytran.geometry.grid import VoxelGrid, ray_code, voxel_code
+from raytran.ops.norms import LayerNorm
 from raytran.ops.pairs import Pairs
 from raytran.ops.splat import splat_in_chunks
-from raytran.ops.traverse import RayTracer
 
 
 class ImageEncoder(nn.Module):
@@ -122,7 +122,7 @@ class VoxelBackbone(nn.Module, ABC):
         grid: VoxelGrid,
         feature_size: tuple[int, int],
         *,
-        ray_tracer: RayTracer,
+        ray_tracer: Callable[..., Pairs],
         rays_per_cell: int,
     ) -> Pairs:
         """Return the pairs of pixels and voxels that exchange features.
@@ -228,8 +228,8 @@ class Backbone(VoxelBackbone):
             RayTracedBlock(channels=channels, num_heads=num_heads, expansion=expansion)
             for _ in range(num_blocks)
         )
-        self.voxel_norm = nn.LayerNorm(channels)
-        self.pixel_norm = nn.LayerNorm(channels)
+        self.voxel_norm = LayerNorm(channels)
+        self.pixel_norm = LayerNorm(channels)
         # Made last, so that the other parts start from the same weights with and without it.
         self.voxel_network = nn.Identity() if voxel_network is None else voxel_network(channels=channels)
 
@@ -239,7 +239,7 @@ class Backbone(VoxelBackbone):
         grid: VoxelGrid,
         feature_size: tuple[int, int],
         *,
-        ray_tracer: RayTracer,
+        ray_tracer: Callable[..., Pairs],
         rays_per_cell: int,
     ) -> Pairs:
         """Return the pairs of pixels and voxels that exchange features: those that a ray joins."""
@@ -288,8 +288,9 @@ class Backbone(VoxelBackbone):
 
     def _voxel_positions(self, grid: VoxelGrid) -> Tensor:
         """Return the position embedding of the voxels, ``(X, Y, Z, C)``; that of every scene is the same."""
-        at_origin = VoxelGrid(grid.resolution, grid.extent, torch.zeros_like(self.voxel_position.bias[:3]))
-        return self.voxel_position(position_code(at_origin.voxel_centers(), grid.extent, self.channels))
+        like, shape = self.unseen, (grid.resolution, grid.extent)  # of the projection there may be 16 bits
+        code = voxel_code(*shape, grid.extent, self.channels, like.dtype, device=like.device)
+        return self.voxel_position(code)
 
     def _updates_pixels(self, index: int, *, with_pixels: bool) -> bool:
         """Say whether block ``index`` changes the pixels: of the last one only pixel features need it."""

@@ -8,6 +8,7 @@ from typing import Literal
 
 from torch import Tensor, nn
 
+from raytran.ops.norms import LayerNorm
 from raytran.ops.pairs import Pairs
 from raytran.ops.ray_attention import Direction, ray_attention_in_chunks
 
@@ -29,8 +30,8 @@ class RayTracedBlock(nn.Module):
 
     def __init__(self, *, channels: int = 256, num_heads: int = 8, expansion: int = 2) -> None:
         super().__init__()
-        self.voxel_norm = nn.LayerNorm(channels)
-        self.pixel_norm = nn.LayerNorm(channels)
+        self.voxel_norm = LayerNorm(channels)
+        self.pixel_norm = LayerNorm(channels)
         self.voxel_stream = Stream(
             channels=channels, num_heads=num_heads, expansion=expansion, direction="pixels_to_voxels"
         )
@@ -85,7 +86,7 @@ class Stream(nn.Module):
         self.key = nn.Linear(channels, channels, bias=False)  # a key bias cancels in the softmax
         self.value = nn.Linear(channels, channels)
         self.output = nn.Linear(channels, channels)
-        self.norm = nn.LayerNorm(channels)
+        self.norm = LayerNorm(channels)
         dimensions: Literal[2, 3] = 3 if direction == "pixels_to_voxels" else 2
         self.feed_forward = ConvFeedForward(
             channels=channels, hidden=expansion * channels, dimensions=dimensions

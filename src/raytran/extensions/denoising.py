@@ -18,9 +18,9 @@ from raytran.errors import ConfigError
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.rotation import yaw_from_rotation
 from raytran.heads.objects import QUERY_SCALE, ObjectHead, ObjectOutputs, Queries
-from raytran.losses.objects import Betas, Match, object_losses
+from raytran.losses.objects import Betas, Match, TrueObjects, object_losses
 from raytran.losses.total import ExtensionLoss
-from raytran.structs import CLASSES, ObjectSet, RawObjects, RawScene
+from raytran.structs import CLASSES, ObjectSet, RawObjects, RawScene, sent_to
 
 CENTER_NOISE = 0.5
 """Largest shift of a centre, as a multiple of the object's size along each of its axes: it stays inside."""
@@ -198,26 +198,26 @@ def denoising_losses(
     Returns:
         ``class``, ``center``, ``size`` and ``yaw``, scalars.
     """
-    scenes, count = layers[-1].class_logits.shape[:2]
-    device = layers[-1].center.device
-    copied, matches = [], []
-    for objects in targets:
-        queries = torch.arange(count if len(objects) else 0, device=device)
-        copied.append(
-            objects.select(copied_objects(len(objects), count, device)) if len(objects) else objects
-        )
-        matches.append(Match(queries, queries))
-    num_queries = layers[-1].center.new_full((), scenes * count)
-    totals: dict[str, Tensor] = {}
-    for layer in layers:
-        found = object_losses(
-            layer,
-            copied,
-            matches,
-            num_objects=num_queries,
-            class_weight=num_queries,
-            no_object_weight=0.0,
-            betas=betas,
-        )
-        totals = {name: totals.get(name, 0.0) + value for name, value in found.items()}
-    return totals
+    stacked = RawObjects.stack(layers)
+    _, scenes, count = stacked.class_logits.shape[:3]
+    copies = torch.arange(count, device="cpu")
+    pairs, first = [copies.new_empty(2, 0)], 0
+    for scene, objects in enumerate(targets):
+        if len(objects):
+            target = first + copied_objects(len(objects), count, copies.device)
+            pairs.append(torch.stack([scene * count + copies, target]))
+        first += len(objects)
+    match = Match(
+        *sent_to(stacked.center.device, torch.cat(pairs, dim=1))[:, None].expand(-1, len(layers), -1)
+    )
+    num_queries = stacked.center.new_full((), scenes * count)
+    found = object_losses(
+        stacked,
+        TrueObjects.of(*targets),
+        match,
+        num_objects=num_queries,
+        class_weight=num_queries,
+        no_object_weight=0.0,
+        betas=betas,
+    )
+    return {name: values.sum() for name, values in found.items()}

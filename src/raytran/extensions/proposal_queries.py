@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from raytran.geometry.grid import VoxelGrid
 from raytran.heads.objects import TYPICAL_SIZE, Queries
-from raytran.losses.objects import Betas, pose_errors
+from raytran.losses.objects import Betas, TrueObjects, pose_errors
 from raytran.losses.total import ExtensionLoss
 from raytran.structs import CLASSES, ObjectSet, RawProposals, RawScene
 
@@ -144,7 +144,8 @@ def proposal_losses(
         totals["heat"] = totals["heat"] + _focal_loss(logits, target) / num_objects
         which, voxel = (heat > LEAST_HEAT).nonzero(as_tuple=True)
         weight = heat[which, voxel] / torch.where(heat > LEAST_HEAT, heat, 0.0).sum(dim=1)[which]
-        errors = pose_errors(center[voxel], log_size[voxel], yaw_vector[voxel], objects.select(which), betas)
+        true = TrueObjects.of(objects).select(which)
+        errors = pose_errors(center[voxel], log_size[voxel], yaw_vector[voxel], true, betas)
         for name, error in errors.items():
             totals[name] = totals[name] + (weight * error).sum() / num_objects
     return totals

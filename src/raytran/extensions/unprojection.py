@@ -7,7 +7,7 @@ rest. Nothing flows back from the voxels to the pixels: pixel features are those
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor, nn
@@ -18,7 +18,6 @@ from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.ops.pairs import PairList, Pairs
 from raytran.ops.splat import splat_in_chunks
-from raytran.ops.traverse import RayTracer
 
 
 class UnprojectionBackbone(VoxelBackbone):
@@ -62,7 +61,7 @@ class UnprojectionBackbone(VoxelBackbone):
         grid: VoxelGrid,
         feature_size: tuple[int, int],
         *,
-        ray_tracer: RayTracer,
+        ray_tracer: Callable[..., Pairs],
         rays_per_cell: int,
     ) -> PairList:
         """Return the pairs of ``pair_centers``; no ray is traced."""

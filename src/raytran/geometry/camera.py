@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from raytran.errors import ShapeError, check_shape
-from raytran.structs import Views
+from raytran.structs import Views, kept_on_device
 
 FARTHEST_CENTER = 1.0
 """Farthest that the principal point of a picture, cropped from a larger one, lies from its middle, in widths
@@ -150,8 +150,8 @@ class Cameras:
         height, width = feature_size
         scaled = self.scaled_to((height, width))
         n = rays_per_cell
-        v, u = torch.broadcast_tensors(*self._cell_points(feature_size, n))
-        image = torch.stack([u, v, torch.ones_like(u)], dim=-1).reshape(-1, 3)
+        dtype, device = self.intrinsics.dtype, self.intrinsics.device
+        image = _points_of_cells(height, width, n, dtype, device=device)
         # On a GPU an error check would make the host wait.
         inverse, _ = torch.linalg.inv_ex(scaled.intrinsics, check_errors=scaled.intrinsics.is_cpu)
         world_from_image = self.world_from_camera[..., :3, :3] @ inverse
@@ -172,18 +172,11 @@ class Cameras:
         picture = self._scaled_picture(feature_size)
         if picture is None:
             return None
-        v, u = self._cell_points(feature_size, rays_per_cell)
-        left, top, right, bottom = picture[..., None, None, None, None, :].unbind(dim=-1)
-        return ((u >= left) & (u < right) & (v >= top) & (v < bottom)).flatten(-2)
-
-    def _cell_points(self, feature_size: tuple[int, int], rays_per_cell: int) -> tuple[Tensor, Tensor]:
-        """Return v ``(h, 1, n, 1)`` and u ``(1, w, 1, n)`` of the rays, in cells of the feature map."""
         (height, width), n = feature_size, rays_per_cell
-        dtype, device = self.intrinsics.dtype, self.intrinsics.device
-        part = (torch.arange(n, dtype=dtype, device=device) + 0.5) / n
-        v = torch.arange(height, dtype=dtype, device=device)[:, None, None, None] + part[:, None]
-        u = torch.arange(width, dtype=dtype, device=device)[None, :, None, None] + part
-        return v, u
+        points = _points_of_cells(height, width, n, self.intrinsics.dtype, device=self.intrinsics.device)
+        u, v, _ = points.view(height, width, n * n, 3).unbind(dim=-1)
+        left, top, right, bottom = picture[..., None, None, None, :].unbind(dim=-1)
+        return (u >= left) & (u < right) & (v >= top) & (v < bottom)
 
     def sees(self, pixels: Tensor, depth: Tensor) -> Tensor:
         """Return which projected points are in front of the camera and in its picture, ``(..., n)`` bool.
@@ -246,6 +239,16 @@ def other_image_size(center: tuple[float, float], image_size: tuple[int, int]) -
     aspect = image_size[1] / image_size[0]
     same = any(abs(width / height / other - 1) < _SAME for other in (aspect, 1 / aspect, 1.0))
     return (round(height), round(width)) if same else None
+
+
+@kept_on_device(16)
+def _points_of_cells(height: int, width: int, n: int, dtype: torch.dtype, *, device: torch.device) -> Tensor:
+    """Return (u, v, 1) of n×n points in every cell of a map, ``(h·w·n·n, 3)``; a cell is 1 wide."""
+    part = (torch.arange(n, dtype=dtype, device=device) + 0.5) / n
+    v = torch.arange(height, dtype=dtype, device=device)[:, None, None, None] + part[:, None]
+    u = torch.arange(width, dtype=dtype, device=device)[None, :, None, None] + part
+    v, u = torch.broadcast_tensors(v, u)
+    return torch.stack([u, v, torch.ones_like(u)], dim=-1).reshape(-1, 3)
 
 
 def pose_from_heading(

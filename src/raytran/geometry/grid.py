@@ -16,6 +16,7 @@ from torch import Tensor
 from raytran.errors import ConfigError, check_shape
 from raytran.geometry.camera import Cameras
 from raytran.setting_limits import MAX_CELLS, check_settings
+from raytran.structs import constant, kept_on_device, sent_to
 
 
 @dataclass(frozen=True)
@@ -82,8 +83,7 @@ class VoxelGrid:
         return (index[..., 0] * y + index[..., 1]) * z + index[..., 2]
 
     def _vector(self, values: tuple[float, ...]) -> Tensor:
-        # Not torch.tensor: a copy to a GPU would make the host wait for it.
-        return torch.stack([self.center.new_full((), value) for value in values])
+        return constant(values, self.center.dtype, device=self.center.device)
 
 
 def checked_grid(
@@ -123,11 +123,60 @@ def position_code(points: Tensor, extent: Sequence[float], channels: int) -> Ten
         ``(..., C)``.
     """
     count = channels // 6
-    steps = torch.linspace(0, 1, count, dtype=points.dtype, device=points.device)
-    cycles = LOWEST * (HIGHEST / LOWEST) ** steps
-    angle = (2 * math.pi * points / points.new_tensor(list(extent)))[..., None] * cycles
-    code = torch.cat([angle.sin(), angle.cos()], dim=-1).flatten(-2)
+    if points.is_cpu:
+        cycles = _cycles(count, points.dtype, device=points.device)
+        sides = constant(tuple(extent), points.dtype, device=points.device)
+        angle = (2 * math.pi * points / sides)[..., None] * cycles
+        code = torch.cat([angle.sin(), angle.cos()], dim=-1).flatten(-2)
+    else:
+        # The same in few launches, and up to rounding: a cosine is the sine of a quarter more.
+        waves, phase = _waves(count, tuple(extent), points.dtype, device=points.device)
+        code = torch.addcmul(phase, points[..., None], waves).sin().flatten(-2)
     return torch.nn.functional.pad(code, (0, channels - 6 * count))
+
+
+@kept_on_device(4)
+def _cycles(count: int, dtype: torch.dtype, *, device: torch.device) -> Tensor:
+    """Return how many waves of each frequency fit into the volume."""
+    return LOWEST * (HIGHEST / LOWEST) ** torch.linspace(0, 1, count, dtype=dtype, device=device)
+
+
+@kept_on_device(4)
+def _waves(
+    count: int, extent: tuple[float, ...], dtype: torch.dtype, *, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Return radians per metre ``(3, 2 · count)``, and what is added to them, for sines and cosines."""
+    here = torch.device("cpu")
+    sides, quarters = (constant(values, torch.float64, device=here) for values in (extent, (0.0, 0.25)))
+    waves = (2 * math.pi * _cycles(count, torch.float64, device=here) / sides[:, None]).repeat(1, 2)
+    phase = 2 * math.pi * quarters.repeat_interleave(count)
+    return sent_to(device, waves.to(dtype)), sent_to(device, phase.to(dtype))
+
+
+@kept_on_device(2)
+def centered_voxels(
+    resolution: tuple[int, int, int],
+    extent: tuple[float, float, float],
+    dtype: torch.dtype,
+    *,
+    device: torch.device,
+) -> Tensor:
+    """Return the centres of all voxels from the centre of their volume, ``(X, Y, Z, 3)`` metres; kept."""
+    return VoxelGrid(resolution, extent, torch.zeros(3, dtype=dtype, device=device)).voxel_centers()
+
+
+@kept_on_device(2)
+def voxel_code(
+    resolution: tuple[int, int, int],
+    extent: tuple[float, float, float],
+    volume: tuple[float, ...],
+    channels: int,
+    dtype: torch.dtype,
+    *,
+    device: torch.device,
+) -> Tensor:
+    """Return ``position_code`` of all voxels in a volume, ``(X, Y, Z, C)``; kept: all scenes have one."""
+    return position_code(centered_voxels(resolution, extent, dtype, device=device), volume, channels)
 
 
 def ray_code(cameras: Cameras, grid: VoxelGrid, feature_size: Sequence[int]) -> Tensor:

@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import cast
 
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from raytran.errors import ConfigError
+from raytran.ops.norms import in_product_dtype
 
 
 class DecoderLayer(nn.Module):
@@ -40,7 +42,7 @@ class DecoderLayer(nn.Module):
                 f"num_heads={num_heads}"
             )
         self.self_norm = nn.LayerNorm(channels)
-        self.self_attention = nn.MultiheadAttention(channels, num_heads, batch_first=True)
+        self.self_attention = SelfAttention(channels, num_heads, batch_first=True)
         self.voxel_norm = nn.LayerNorm(channels)
         make_attention = VoxelAttention if voxel_attention is None else voxel_attention
         self.voxel_attention = make_attention(channels=channels, num_heads=num_heads)
@@ -70,13 +72,37 @@ class DecoderLayer(nn.Module):
         Returns:
             ``(B, Q, C)``.
         """
-        x = self.self_norm(queries)
-        located = x + position
-        attended, _ = self.self_attention(located, located, x, need_weights=False, attn_mask=mask)
-        queries = queries + attended
-        located = self.voxel_norm(queries) + position
+        x = in_product_dtype(self.self_norm(queries))
+        queries = queries + self.self_attention(x + position, x, mask)
+        located = in_product_dtype(self.voxel_norm(queries)) + position
         queries = queries + self.voxel_attention(located, reference, memory, voxel_position)
         return queries + self.feed_forward(queries)
+
+
+class SelfAttention(nn.MultiheadAttention):
+    """Attention of the queries to each other, located by a code of their positions that values leave out."""
+
+    def forward(self, located: Tensor, x: Tensor, mask: Tensor | None = None) -> Tensor:  # type: ignore[override]
+        """Return ``(B, Q, C)``.
+
+        Args:
+            located: ``(B, Q, C)`` queries with the code of their positions.
+            x: ``(B, Q, C)`` queries.
+            mask: ``(Q, Q)`` bool, as in ``DecoderLayer.forward``.
+        """
+        if located.is_cpu:  # to the last bit as ever; there is nothing to gain
+            return super().forward(located, located, x, need_weights=False, attn_mask=mask)[0]
+        both = 2 * self.embed_dim  # queries and keys are made in one product
+        (weight, of_values), (bias, of_value) = (
+            parameter.split([both, self.embed_dim])
+            for parameter in (cast("Tensor", self.in_proj_weight), self.in_proj_bias)
+        )
+        query, key = F.linear(located, weight, bias).unflatten(-1, (2, self.num_heads, -1)).unbind(2)
+        value = F.linear(x, of_values, of_value).unflatten(-1, (self.num_heads, -1))
+        query, key, value = (part.transpose(1, 2) for part in (query, key, value))
+        allowed = None if mask is None else ~mask
+        attended = F.scaled_dot_product_attention(query, key, value, attn_mask=allowed)
+        return self.out_proj(attended.transpose(1, 2).flatten(2))
 
 
 class VoxelAttention(nn.Module):

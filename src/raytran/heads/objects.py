@@ -5,16 +5,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.quasirandom import SobolEngine
 
 from raytran.errors import ConfigError
-from raytran.geometry.grid import VoxelGrid, position_code
+from raytran.geometry.grid import VoxelGrid, centered_voxels, position_code, voxel_code
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.heads.decoder import DecoderLayer
+from raytran.ops.norms import in_product_dtype
 from raytran.structs import CLASSES, PADDING, ObjectSet, RawObjects, RawProposals
 
 QUERY_SCALE = 0.1
@@ -178,17 +180,27 @@ class ObjectHead(nn.Module):
             mask: ``(Q, Q)`` bool, which queries must not attend to which, see ``DecoderLayer.forward``.
         """
         grid_center = grid.center.to(self.extent.dtype)
-        at_origin = VoxelGrid(grid.resolution, grid.extent, torch.zeros_like(self.extent))
-        voxel_position = at_origin.voxel_centers().flatten(0, 2)
-        memory = voxels.flatten(1, 3) + self._encode_positions(voxel_position)
+        shape, like = (grid.resolution, grid.extent), self.extent
+        voxel_position = centered_voxels(*shape, like.dtype, device=like.device).flatten(0, 2)
+        channels = self.position.in_features
+        code = voxel_code(*shape, self.grid_extent, channels, like.dtype, device=like.device)
+        memory = voxels.flatten(1, 3) + self.position(code.flatten(0, 2))
         embedding = queries.embedding
-        outputs = []
+        # On a GPU what the next layer does not start from is predicted for all layers together.
+        together = type(self.refinement) is CenterRefinement and not voxels.is_cpu
+        outputs, places = [], []
         for layer, predictor in zip(self.layers, self.predictors, strict=True):
             position = self._encode_positions(queries.reference)
             embedding = layer(embedding, position, queries.reference, memory, voxel_position, mask)
-            objects = predictor(embedding, queries, grid_center)
-            queries = self.refinement(queries, objects, grid_center)
-            outputs.append(objects)
+            if together:
+                places.append(cast("ObjectPredictor", predictor).place(embedding, queries.reference))
+                queries = queries._replace(reference=places[-1].reference)
+            else:
+                objects = predictor(embedding, queries, grid_center)
+                queries = self.refinement(queries, objects, grid_center)
+                outputs.append(objects)
+        if together:
+            return predict_together(list(self.predictors), places, queries, grid_center)
         return tuple(outputs)
 
     def _encode_positions(self, points: Tensor) -> Tensor:
@@ -210,6 +222,20 @@ class CenterRefinement(nn.Module):
         return start._replace(reference=objects.center - grid_center[:, None])
 
 
+class _Place(NamedTuple):
+    """What a layer predicts first.
+
+    Attributes:
+        embedding: ``(B, Q, C)`` normalised.
+        read: the same, as products read it.
+        reference: ``(B, Q, 3)`` box centres, metres from the centre of the volume.
+    """
+
+    embedding: Tensor
+    read: Tensor
+    reference: Tensor
+
+
 class ObjectPredictor(nn.Module):
     """Class and pose of each query, one small network each.
 
@@ -225,6 +251,12 @@ class ObjectPredictor(nn.Module):
         self.log_size = _perceptron(channels, 3)
         self.yaw = _perceptron(channels, 2)
 
+    def place(self, embedding: Tensor, reference: Tensor) -> _Place:
+        """Return where the objects of query embeddings ``(B, Q, C)`` stand, near the reference points."""
+        embedding = self.norm(embedding)
+        read = in_product_dtype(embedding)
+        return _Place(embedding, read, reference + self.offset(read).float())
+
     def forward(self, embedding: Tensor, start: Queries, grid_center: Tensor) -> RawObjects:
         """Return the predictions for query embeddings ``(B, Q, C)``, added to the boxes of ``start``.
 
@@ -238,6 +270,39 @@ class ObjectPredictor(nn.Module):
             yaw_vector=start.yaw_vector + self.yaw(embedding).float(),
             embedding=embedding,
         )
+
+
+def predict_together(
+    predictors: Sequence[Any], places: Sequence[_Place], start: Queries, grid_center: Tensor
+) -> tuple[RawObjects, ...]:
+    """Return what the predictors of all layers predict, as they do one by one.
+
+    Args:
+        predictors: an ``ObjectPredictor`` for each of L layers.
+        places: what they have predicted.
+        start: sizes and yaws that all layers start from.
+        grid_center: ``(B, 3)`` metres.
+    """
+    read = torch.stack([place.read for place in places]).flatten(1, 2)
+
+    def predicted(name: str) -> Tensor:
+        perceptrons = [getattr(one, name) for one in predictors]
+        hidden = F.gelu(_apply_each([one[0] for one in perceptrons], read))
+        return _apply_each([one[2] for one in perceptrons], hidden).float().unflatten(1, scenes)
+
+    scenes = start.reference.shape[:2]
+    logits = _apply_each([one.category for one in predictors], read).float().unflatten(1, scenes)
+    center = torch.stack([place.reference for place in places]) + grid_center[:, None]
+    log_size, yaw_vector = start.log_size + predicted("log_size"), start.yaw_vector + predicted("yaw")
+    embeddings = [place.embedding for place in places]
+    return tuple(map(RawObjects, logits, center, log_size, yaw_vector, embeddings))
+
+
+def _apply_each(layers: Sequence[nn.Linear], x: Tensor) -> Tensor:
+    """Return what L linear layers make each of its own input, ``(L, n, C)`` → ``(L, n, outputs)``."""
+    weight, bias = (torch.stack([getattr(one, name) for one in layers]) for name in ("weight", "bias"))
+    # The weights first, so that their gradients come out as they lie.
+    return torch.baddbmm(bias[..., None], weight, x.mT).mT
 
 
 def _perceptron(channels: int, outputs: int) -> nn.Sequential:

@@ -6,13 +6,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
+import numpy as np
 import torch
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor, nn
 
 from raytran.errors import ConfigError
-from raytran.losses.objects import Betas, Match, pose_errors
-from raytran.structs import ObjectSet, RawObjects
+from raytran.losses.objects import Betas, Match, TrueObjects, pose_errors
+from raytran.structs import RawObjects, sent_to
 
 UNUSABLE = 1e6
 """Cost in place of one that is not finite, as 16-bit training meets in steps that its scaler then skips."""
@@ -53,30 +54,42 @@ class HungarianMatcher(nn.Module):
         self.weights = {name: float(weights[name]) for name in ("class", "center", "size", "yaw")}
 
     @torch.no_grad()
-    def forward(self, raw: RawObjects, targets: Sequence[ObjectSet]) -> list[Match]:
-        """Match one decoder layer's queries ``(B, Q, ...)`` with the objects of B scenes."""
-        return [self._match(raw, scene, objects) for scene, objects in enumerate(targets)]
+    def forward(self, layers: RawObjects, targets: TrueObjects, counts: Sequence[int]) -> Match:
+        """Match the queries of every layer with the objects of their scene; P is the sum of min(Q, M).
 
-    def _match(self, raw: RawObjects, scene: int, objects: ObjectSet) -> Match:
-        device = raw.center.device
-        query, target = linear_sum_assignment(self.cost(raw, scene, objects).cpu().numpy())
-        return Match(torch.as_tensor(query, device=device), torch.as_tensor(target, device=device))
+        The costs come to the host in one copy, for which it waits, and the pairs go back in one.
 
-    def cost(self, raw: RawObjects, scene: int, objects: ObjectSet) -> Tensor:
-        """Return the cost ``(Q, M)`` of every query of ``scene`` with every true object."""
+        Args:
+            layers: predictions ``(L, B, Q, ...)``.
+            targets: true objects of the B scenes.
+            counts: how many of them each scene has.
+        """
+        cost = self.cost(layers, targets).cpu().numpy()
+        num_layers, num_scenes, num_queries, _ = cost.shape
+        pairs, first = [np.empty((2, num_layers, 0), dtype=np.int64)], 0
+        for scene in range(num_scenes):
+            last = first + counts[scene]
+            found = [linear_sum_assignment(of_layer[scene, :, first:last]) for of_layer in cost]
+            query, target = np.stack(found, axis=1)
+            pairs.append(np.stack([query + scene * num_queries, target + first]))
+            first = last
+        return Match(*sent_to(layers.center.device, torch.from_numpy(np.concatenate(pairs, axis=2))))
+
+    def cost(self, layers: RawObjects, targets: TrueObjects) -> Tensor:
+        """Return the cost ``(..., M)`` of every query ``(...)`` with every true object of all scenes."""
         errors = pose_errors(
-            raw.center[scene, :, None],
-            raw.log_size[scene, :, None],
-            raw.yaw_vector[scene, :, None],
-            objects,
+            layers.center[..., None, :],
+            layers.log_size[..., None, :],
+            layers.yaw_vector[..., None, :],
+            targets,
             self.betas,
         )
-        terms = {"class": self._class_cost(raw.class_logits[scene].float())[:, objects.label], **errors}
+        terms = {"class": self._class_cost(layers.class_logits.float())[..., targets.label], **errors}
         cost = torch.stack([self.weights[name] * term for name, term in terms.items()]).sum(dim=0)
         return torch.nan_to_num(cost, nan=UNUSABLE, posinf=UNUSABLE, neginf=UNUSABLE)
 
     def _class_cost(self, logits: Tensor) -> Tensor:
-        """Return what each class costs each query, ``(Q, K + 1)`` as the logits."""
+        """Return what each class costs each query, ``(..., K + 1)`` as the logits."""
         if self.class_cost == "cross_entropy":
             return -logits.log_softmax(dim=-1)
         return -logits.softmax(dim=-1)

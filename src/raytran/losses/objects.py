@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -17,15 +16,46 @@ from raytran.structs import PADDING, ObjectSet, RawObjects
 
 
 class Match(NamedTuple):
-    """Matched pairs of one scene.
+    """Matched pairs of queries and true objects, of L decoder layers; P of each, those of B scenes together.
 
     Attributes:
-        query: ``(m,)`` int64, query of each pair.
-        target: ``(m,)`` int64, true object of each pair; m = min(Q, M).
+        query: ``(L, P)`` int64, the query of each pair, counted scene-major from 0 to B · Q.
+        target: ``(L, P)`` int64, its true object, counted through all scenes as in ``TrueObjects``.
     """
 
     query: Tensor
     target: Tensor
+
+
+class TrueObjects(NamedTuple):
+    """Class and pose of the true objects of all scenes, one scene after another; M in all.
+
+    Attributes:
+        label: ``(M,)`` int64.
+        center: ``(M, 3)`` metres.
+        log_size: ``(M, 3)``.
+        yaw: ``(M,)`` radians.
+        symmetry: ``(M,)`` int64, see ``ObjectSet``.
+    """
+
+    label: Tensor
+    center: Tensor
+    log_size: Tensor
+    yaw: Tensor
+    symmetry: Tensor
+
+    @classmethod
+    def of(cls, *scenes: ObjectSet) -> TrueObjects:
+        """Join the objects of scenes, at least one."""
+        label, center, size, rotation, symmetry = (
+            getattr(scenes[0], name) if len(scenes) == 1 else torch.cat([getattr(s, name) for s in scenes])
+            for name in ("label", "center", "size", "rotation", "symmetry")
+        )
+        return cls(label, center, size.log(), yaw_from_rotation(rotation), symmetry)
+
+    def select(self, index: Tensor) -> TrueObjects:
+        """Return the objects at ``index``, int64 of any shape."""
+        return TrueObjects(*(values[index] for values in self))
 
 
 class Betas(NamedTuple):
@@ -52,7 +82,7 @@ class Betas(NamedTuple):
 
 
 def pose_errors(
-    center: Tensor, log_size: Tensor, yaw_vector: Tensor, target: ObjectSet, betas: Betas
+    center: Tensor, log_size: Tensor, yaw_vector: Tensor, target: TrueObjects, betas: Betas
 ) -> dict[str, Tensor]:
     """Return the pose losses of predictions against true objects, not reduced over objects.
 
@@ -63,17 +93,16 @@ def pose_errors(
         center: ``(..., M or 1, 3)`` metres.
         log_size: ``(..., M or 1, 3)``.
         yaw_vector: ``(..., M or 1, 2)`` (sin, cos), of any length.
-        target: M true objects.
+        target: the true objects, ``(M,)`` or one for each prediction.
         betas: of smooth L1.
 
     Returns:
         ``center``, ``size`` and ``yaw``, each ``(..., M)``.
     """
-    yaw = yaw_from_vector(yaw_vector)
-    yaw_error = symmetric_yaw_error(yaw, yaw_from_rotation(target.rotation), target.symmetry)
+    yaw_error = symmetric_yaw_error(yaw_from_vector(yaw_vector), target.yaw, target.symmetry)
     return {
         "center": _smooth_l1(center - target.center, betas.center).sum(dim=-1),
-        "size": (log_size - target.size.log()).abs().sum(dim=-1),
+        "size": (log_size - target.log_size).abs().sum(dim=-1),
         "yaw": _smooth_l1(yaw_error, betas.yaw),
     }
 
@@ -97,21 +126,21 @@ def yaw_from_vector(yaw_vector: Tensor) -> Tensor:
 
 
 def object_losses(
-    raw: RawObjects,
-    targets: Sequence[ObjectSet],
-    matches: Sequence[Match],
+    layers: RawObjects,
+    targets: TrueObjects,
+    match: Match,
     *,
     num_objects: Tensor,
     class_weight: Tensor,
     no_object_weight: float,
     betas: Betas,
 ) -> dict[str, Tensor]:
-    """Return the class and pose losses of one decoder layer.
+    """Return the class and pose losses of some decoder layers.
 
     Args:
-        raw: predictions of B scenes.
-        targets: true objects of B scenes.
-        matches: pairs of queries and true objects.
+        layers: predictions ``(L, B, Q, ...)``.
+        targets: true objects of the B scenes.
+        match: pairs of queries and true objects.
         num_objects: scalar by which the pose losses' sums are divided.
         class_weight: scalar by which the cross entropies' weighted sum over queries is divided; the sum of
             the weights gives their mean.
@@ -119,24 +148,22 @@ def object_losses(
         betas: of the poses' smooth L1.
 
     Returns:
-        ``class``, ``center``, ``size`` and ``yaw``, scalars; zero pose losses without objects.
+        ``class``, ``center``, ``size`` and ``yaw`` of each layer, ``(L,)``; zero pose losses without objects.
     """
-    label = torch.full(raw.class_logits.shape[:2], PADDING, device=raw.class_logits.device)
-    losses = {name: raw.center.new_zeros(()) for name in ("class", "center", "size", "yaw")}
-    for scene, (objects, match) in enumerate(zip(targets, matches, strict=True)):
-        label[scene, match.query] = objects.label[match.target]
-        errors = pose_errors(
-            raw.center[scene, match.query],
-            raw.log_size[scene, match.query],
-            raw.yaw_vector[scene, match.query],
-            objects.select(match.target),
-            betas,
-        )
-        for name, error in errors.items():
-            losses[name] = losses[name] + error.sum() / num_objects
-    weight_of = torch.ones(PADDING + 1, device=label.device)
-    weight_of[PADDING] = no_object_weight
-    logits = raw.class_logits.float().flatten(0, 1)
-    entropy = F.cross_entropy(logits, label.flatten(), weight=weight_of, reduction="sum")
-    losses["class"] = entropy / class_weight
-    return losses
+    logits = layers.class_logits.float().flatten(1, 2)
+    true = targets.select(match.target)
+    label = torch.full(logits.shape[:2], PADDING, device=logits.device).scatter_(1, match.query, true.label)
+    entropy = -logits.log_softmax(dim=-1).gather(2, label[..., None])[..., 0]
+    entropy = entropy * torch.ones_like(entropy).masked_fill(label == PADDING, no_object_weight)
+    center, log_size, yaw_vector = (
+        pick_queries(values, match.query) for values in (layers.center, layers.log_size, layers.yaw_vector)
+    )
+    errors = pose_errors(center, log_size, yaw_vector, true, betas)
+    losses = {"class": entropy.sum(dim=-1) / class_weight}
+    return losses | {name: error.sum(dim=-1) / num_objects for name, error in errors.items()}
+
+
+def pick_queries(values: Tensor, query: Tensor) -> Tensor:
+    """Return values ``(L, B, Q, n)`` at ``Match.query``, ``(L, P, n)``."""
+    flat = values.flatten(1, 2)
+    return flat.gather(1, query[..., None].expand(-1, -1, flat.shape[-1]))

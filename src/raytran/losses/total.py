@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 from raytran.errors import ConfigError, DataError
 from raytran.losses.matcher import HungarianMatcher
-from raytran.losses.objects import Betas, Match, object_losses
-from raytran.structs import ObjectSet, RawObjects, RawScene, SceneBatch, Views
+from raytran.losses.objects import Betas, Match, TrueObjects, object_losses, pick_queries
+from raytran.structs import ObjectSet, RawObjects, RawScene, SceneBatch, Views, constant
 
 
 def occupancy_loss(logits: Tensor, target: Tensor) -> Tensor:
@@ -169,8 +169,9 @@ class TotalLoss(nn.Module):
                 losses["view"] = view_loss(*_both("view", raw.new_views, batch.new_views))
             if "objects" in terms or "shape" in terms:
                 losses |= self._objects(raw, batch, terms, decode_shapes, mean_over_ranks)
-            weighted = [self._weight(name) * value for name, value in losses.items()]
-            losses["total"] = torch.stack(weighted).sum()
+            values = torch.stack(list(losses.values()))
+            weights = constant(tuple(map(self._weight, losses)), values.dtype, device=values.device)
+            losses["total"] = (weights * values).sum()
         return losses
 
     def _objects(
@@ -181,62 +182,64 @@ class TotalLoss(nn.Module):
         decode_shapes: Callable[[Tensor], Tensor] | None,
         mean_over_ranks: Callable[[Tensor], Tensor] | None,
     ) -> dict[str, Tensor]:
-        layers, targets = _both("objects", raw.objects, batch.objects)
-        layers = tuple(layer.in_float32() for layer in layers)
-        num_objects, class_weight = self._divisors(layers[-1], targets, mean_over_ranks)
-        last = self.matcher(layers[-1], targets)
+        predicted, scenes = _both("objects", raw.objects, batch.objects)
+        every_layer = "objects" in terms or self.shape_layers == "all"
+        layers = RawObjects.stack(predicted if every_layer else predicted[-1:]).in_float32()
+        targets, counts = TrueObjects.of(*scenes), [len(objects) for objects in scenes]
+        num_objects, class_weight = self._divisors(layers, counts, mean_over_ranks)
+        match = self.matcher(layers, targets, counts)
         losses: dict[str, Tensor] = {}
         if "shape" in terms:
             if decode_shapes is None:
                 raise ConfigError("the loss term shape needs decode_shapes: give RayTran.decode_shapes")
-            losses["shape"] = _matched_shape_loss(layers[-1], targets, last, decode_shapes, num_objects)
-        earlier_shapes = "shape" in terms and self.shape_layers == "all"
-        for index, layer in enumerate(layers if "objects" in terms or earlier_shapes else ()):
-            is_last = index + 1 == len(layers)
-            matches = last if is_last else self.matcher(layer, targets)
-            if earlier_shapes and decode_shapes is not None and not is_last:
-                value = _matched_shape_loss(layer, targets, matches, decode_shapes, num_objects)
-                losses[f"shape/layer{index}"] = value
-            if "objects" not in terms:
-                continue
-            found = object_losses(
-                layer,
-                targets,
-                matches,
-                num_objects=num_objects,
-                class_weight=class_weight,
-                no_object_weight=self.no_object_weight,
-                betas=self.betas,
+            of_layers = slice(None) if self.shape_layers == "all" else slice(-1, None)
+            found = _matched_shape_losses(
+                layers.embedding[of_layers],
+                scenes,
+                Match(match.query[of_layers], match.target[of_layers]),
+                decode_shapes,
+                num_objects,
             )
-            suffix = "" if is_last else f"/layer{index}"
-            losses |= {f"objects/{name}{suffix}": value for name, value in found.items()}
-        if "objects" in terms:
-            for name, extension in self.extensions.items():
-                if getattr(raw, cast("ExtensionLoss", extension).reads) is None:
-                    continue
-                found = extension(raw, targets, num_objects=num_objects, betas=self.betas)
-                losses |= {f"objects/{term}/{name}": value for term, value in found.items()}
+            losses |= _by_layer("shape", found)
+        if "objects" not in terms:
+            return losses
+        of_pairs = object_losses(
+            layers,
+            targets,
+            match,
+            num_objects=num_objects,
+            class_weight=class_weight,
+            no_object_weight=self.no_object_weight,
+            betas=self.betas,
+        )
+        for name, values in of_pairs.items():
+            losses |= _by_layer(f"objects/{name}", values.unbind())
+        for name, extension in self.extensions.items():
+            if getattr(raw, cast("ExtensionLoss", extension).reads) is None:
+                continue
+            found_there = extension(raw, scenes, num_objects=num_objects, betas=self.betas)
+            losses |= {f"objects/{term}/{name}": value for term, value in found_there.items()}
         return losses
 
     def _divisors(
         self,
-        raw: RawObjects,
-        targets: Sequence[ObjectSet],
+        layers: RawObjects,
+        counts: Sequence[int],
         mean_over_ranks: Callable[[Tensor], Tensor] | None,
     ) -> tuple[Tensor, Tensor]:
-        """Return the number of true objects and the queries' total weight in the cross entropy, a rank."""
-        scenes, queries = raw.class_logits.shape[:2]
-        matched = sum(min(queries, len(objects)) for objects in targets)
+        """Return the number of true objects and a layer's total weight in the cross entropy, a rank."""
+        scenes, queries = layers.class_logits.shape[1:3]
+        matched = sum(min(queries, count) for count in counts)
         weight = matched + self.no_object_weight * (scenes * queries - matched)
-        count = sum(len(objects) for objects in targets)
+        count = sum(counts)
         # Without any object, one a scene. A bound of one a rank would be wrong: on two ranks it makes two.
         without_any = float(scenes)
         # Numbers are filled in on the device: a copy to it would make the host wait.
         if mean_over_ranks is None:
-            return raw.center.new_full((), count or without_any), raw.center.new_full(
+            return layers.center.new_full((), count or without_any), layers.center.new_full(
                 (), weight or without_any
             )
-        means = mean_over_ranks(torch.stack([raw.center.new_full((), value) for value in (count, weight)]))
+        means = mean_over_ranks(torch.stack([layers.center.new_full((), value) for value in (count, weight)]))
         num_objects, class_weight = torch.where(means > 0, means, without_any).unbind()
         return num_objects, class_weight
 
@@ -245,24 +248,42 @@ class TotalLoss(nn.Module):
         return self.weights[name.removeprefix("objects/").split("/")[0]]
 
 
-def _matched_shape_loss(
-    raw: RawObjects,
+def _by_layer(name: str, values: Sequence[Tensor]) -> dict[str, Tensor]:
+    """Name the values of layers: that of the last one without its number."""
+    last = len(values) - 1
+    return {name if i == last else f"{name}/layer{i}": value for i, value in enumerate(values)}
+
+
+def _matched_shape_losses(
+    embedding: Tensor,
     targets: Sequence[ObjectSet],
-    matches: Sequence[Match],
+    match: Match,
     decode_shapes: Callable[[Tensor], Tensor],
     num_objects: Tensor,
-) -> Tensor:
-    """Return the shape loss of the matched queries, and of them alone: a 63³ grid for each of Q is dear."""
+) -> list[Tensor]:
+    """Return each layer's shape loss of the matched queries, and of them alone: 63³ for each of Q is dear.
+
+    Args:
+        embedding: ``(L, B, Q, C)``; layers are decoded one at a time.
+        targets: true objects of B scenes.
+        match: their pairs with the queries.
+        decode_shapes: as that of ``TotalLoss.forward``.
+        num_objects: scalar by which the sums are divided.
+    """
     if any(objects.shape is None and len(objects) > 0 for objects in targets):
         raise DataError(
             "the loss term shape needs shape grids in the batch: add shapes to the data set's targets"
         )
-    embedding = torch.cat([raw.embedding[i, match.query] for i, match in enumerate(matches)])
-    if not len(embedding):
+    if not match.query.shape[1]:
         # Decode one query and count it nothing, so that every rank of a parallel run has gradients to add.
-        return 0.0 * decode_shapes(raw.embedding[:1, 0]).float().sum()
-    wanted = [o.shape[match.target] for o, match in zip(targets, matches, strict=True) if o.shape is not None]
-    return shape_loss(decode_shapes(embedding), torch.cat(wanted), num_objects=num_objects)
+        return [0.0 * decode_shapes(of_layer[:1, 0]).float().sum() for of_layer in embedding]
+    shapes = [objects.shape for objects in targets if objects.shape is not None]
+    shape = shapes[0] if len(shapes) == 1 else torch.cat(shapes)
+    matched = pick_queries(embedding, match.query)
+    return [
+        shape_loss(decode_shapes(some), shape[target], num_objects=num_objects)
+        for some, target in zip(matched, match.target, strict=True)
+    ]
 
 
 def _under_current_autocast(function: Callable[[Tensor], Tensor], device: str) -> Callable[[Tensor], Tensor]:

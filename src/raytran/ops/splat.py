@@ -89,16 +89,31 @@ def _(features: Tensor, by_voxel: Sequence[Tensor], by_pixel: Sequence[Tensor]) 
     return features.new_empty(by_voxel[0].shape[0] - 1, features.shape[1])
 
 
+@torch.library.custom_op("raytran::pair_mean_backward", mutates_args=())
+def _mean_backward(grad: Tensor, by_voxel: Sequence[Tensor], by_pixel: Sequence[Tensor]) -> Tensor:
+    """Return the gradient ``(num_pixels, C)`` of ``features``.
+
+    An operator of its own: ``torch.compile`` does not pass through products of sparse matrices.
+    """
+    of_voxel, order = PairOrder(*by_voxel), PairOrder(*by_pixel)
+    ones = grad.new_ones(order.col_index.shape)
+    return sparse_product(ones, grad / _counts(of_voxel, grad), order)
+
+
+@_mean_backward.register_fake
+def _(grad: Tensor, by_voxel: Sequence[Tensor], by_pixel: Sequence[Tensor]) -> Tensor:
+    return grad.new_empty(by_pixel[0].shape[0] - 1, grad.shape[1])
+
+
 def _keep(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
     _, by_voxel, by_pixel = inputs
     ctx.save_for_backward(*by_voxel, *by_pixel)
 
 
 def _gradient(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
-    by_voxel, by_pixel = PairOrder(*ctx.saved_tensors[:3]), PairOrder(*ctx.saved_tensors[3:])
-    ones = grad.new_ones(by_pixel.col_index.shape)
+    saved = list(ctx.saved_tensors)
     with torch.autocast(grad.device.type, enabled=False):
-        back = sparse_product(ones, grad / _counts(by_voxel, grad), by_pixel)
+        back = _mean_backward(grad, saved[:3], saved[3:])
     return back, [None] * 3, [None] * 3
 
 

@@ -23,6 +23,7 @@ from raytran.errors import ConfigError, ShapeError, check_shape
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.ops.pairs import PairList, Pairs, interpreted, why_no_kernels
+from raytran.structs import HostCopy
 
 NUDGE = 1e-9
 """Lengths below this count as zero: metres of depth along a ray, and sizes of a voxel for positions."""
@@ -36,6 +37,9 @@ depth far below ``NUDGE``, wherever it begins, so that nothing has to be taken o
 
 _VIEWS_AT_ONCE = 8
 """Views that are counted together."""
+
+_LEAST_ROOM = 256
+"""Block pairs for which there is always room."""
 
 _AT_ONCE = {"cpu": 1 << 18}
 _AT_ONCE_ELSEWHERE = 1 << 23
@@ -250,31 +254,75 @@ class RayTracer:
                 f"unknown attention={attention}: choose one of {', '.join(get_args(Attention))}"
             )
         self.attention = attention
+        self.fits: Tensor | None = None
+        self._most: dict[tuple[int, ...], int] = {}
+        self._coming: list[tuple[tuple[int, ...], HostCopy]] = []
 
     @torch.compiler.disable
     def __call__(
         self, cameras: Cameras, grid: VoxelGrid, feature_size: tuple[int, int], rays_per_cell: int
     ) -> Pairs:
-        """Return the pairs of ``trace_pairs``, with both orders made; arguments and errors are its own.
+        """Return the pairs of ``trace_pairs``, with both orders and counts made; arguments are its own.
 
         Raises:
             ConfigError: ``attention`` is ``fused`` and the fused kernels do not run here.
         """
+        self.fits = None
         pairs: Pairs
         if self._is_fused(cameras.intrinsics.device):
             # CPU installations of torch lack Triton: its module is imported only where it runs.
             from raytran.ops.triton.traverse import trace_blocks
 
             pairs, _ = trace_blocks(cameras, grid, feature_size, rays_per_cell)
+            self._remember(_kind(cameras, grid, feature_size, rays_per_cell), len(pairs))
         else:
             pairs = trace_pairs(cameras, grid, feature_size, rays_per_cell)
             pairs = pairs if self.attention == "auto" else replace(pairs, fused=False)
-        # Their sizes depend on the data: better here than in code compiled for one size.
-        pairs.orders()
-        return pairs
+        return _complete(pairs)
+
+    @torch.compiler.disable
+    def without_waiting(
+        self, cameras: Cameras, grid: VoxelGrid, feature_size: tuple[int, int], rays_per_cell: int
+    ) -> Pairs:
+        """Return the pairs without waiting for their number: there is room for twice the most so far.
+
+        ``fits``, ``()`` bool on the device, then says whether that sufficed. If not, the last are missing
+        and nothing may be learned from the rest. It is None where all are there for certain: without kernels,
+        or when such rays are traced for the first time, for which the host waits.
+        """
+        while self._coming and self._coming[0][1].has_arrived():
+            kind, number = self._coming.pop(0)
+            self._remember(kind, int(number.values()))
+        kind = _kind(cameras, grid, feature_size, rays_per_cell)
+        if kind not in self._most or not self._is_fused(cameras.intrinsics.device):
+            return self(cameras, grid, feature_size, rays_per_cell)
+        from raytran.ops.triton.traverse import trace_blocks
+
+        room = max(2 * self._most[kind], _LEAST_ROOM)
+        pairs, found = trace_blocks(cameras, grid, feature_size, rays_per_cell, capacity=room)
+        self.fits = found <= room
+        self._coming.append((kind, HostCopy(found)))
+        return _complete(pairs)
+
+    def _remember(self, kind: tuple[int, ...], number: int) -> None:
+        self._most[kind] = max(number, self._most.get(kind, 0))
 
     def _is_fused(self, device: torch.device) -> bool:
         reason = why_no_kernels(device)
         if self.attention == "fused" and reason is not None and not interpreted():
             raise ConfigError(f"attention=fused needs a GPU with Triton, but {reason}: set attention=auto")
         return self.attention == "fused" or (self.attention == "auto" and reason is None)
+
+
+def _kind(
+    cameras: Cameras, grid: VoxelGrid, feature_size: tuple[int, int], rays_per_cell: int
+) -> tuple[int, ...]:
+    """Return what is alike in all steps of a run."""
+    return (*cameras.intrinsics.shape, *grid.resolution, *feature_size, rays_per_cell)
+
+
+def _complete(pairs: Pairs) -> Pairs:
+    """Return the pairs with all made that depends on the data: better here than in compiled code."""
+    pairs.orders()
+    pairs.pixels_per_voxel()
+    return pairs

@@ -5,25 +5,36 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import groupby
 
 import torch
 from torch import Tensor, nn
 from torch.nn.modules.batchnorm import _BatchNorm
 
 from raytran.losses.matcher import HungarianMatcher
-from raytran.losses.objects import Match
+from raytran.losses.objects import TrueObjects
 from raytran.structs import PADDING, ObjectSet, RawObjects
 from raytran.training.ranks import mean_over_ranks
 
 
 def gradient_norms(model: nn.Module) -> dict[str, Tensor]:
-    """Return the L2 norm of the gradients of each part: ``backbone``, ``objects`` and so on, scalars."""
-    gradients: dict[str, list[Tensor]] = {}
-    for name, parameter in model.named_parameters():
-        if parameter.grad is not None:
-            part = name.removeprefix("heads.").split(".")[0]
-            gradients.setdefault(part, []).append(parameter.grad)
-    return {part: nn.utils.get_total_norm(found) for part, found in gradients.items()}
+    """Return the L2 norms of the gradients of each part, ``backbone``, ``objects`` …, and of ``all``.
+
+    They are scalars. A part's parameters follow one another in the network.
+    """
+    gradients = {
+        name: parameter.grad for name, parameter in model.named_parameters() if parameter.grad is not None
+    }
+    if not gradients:
+        return {}
+    norms = torch.stack(torch._foreach_norm(list(gradients.values())))
+    parts = groupby(name.removeprefix("heads.").split(".")[0] for name in gradients)
+    names, counts = zip(*((part, sum(1 for _ in members)) for part, members in parts), strict=True)
+    found = {
+        name: torch.linalg.vector_norm(some)
+        for name, some in zip(names, norms.split(list(counts)), strict=True)
+    }
+    return found | {"all": torch.linalg.vector_norm(norms)}
 
 
 @torch.no_grad()
@@ -41,7 +52,11 @@ def slot_signals(
         mean number of objects over that of queries; if it stays 0, the padding class has won.
     """
     objects = RawObjects(**{name: value.float() for name, value in vars(objects).items()})
-    right, matched = _count_right(objects, targets, matcher(objects, targets))
+    true = TrueObjects.of(*targets)
+    match = matcher(RawObjects.stack([objects]), true, [len(of_scene) for of_scene in targets])
+    surest = objects.class_logits.argmax(dim=-1).flatten()[match.query[0]]
+    right = (surest == true.label[match.target[0]]).float().sum()
+    matched = right.new_full((), match.query.shape[1])
     log_probability = objects.class_logits.log_softmax(dim=-1)
     entropy = -(log_probability.exp() * log_probability).sum(dim=-1) / math.log(PADDING + 1)
     used = (log_probability.argmax(dim=-1) != PADDING).float()
@@ -49,19 +64,6 @@ def slot_signals(
     right, matched, entropy, used = mean_over_ranks(sums).unbind()
     found = {"class_entropy": entropy, "slots_used": used}
     return found | ({"class_accuracy": right / matched} if matched > 0 else {})
-
-
-def _count_right(
-    objects: RawObjects, targets: Sequence[ObjectSet], matches: Sequence[Match]
-) -> tuple[Tensor, Tensor]:
-    """Return the number of matched queries whose surest class is right, and of all of them."""
-    label = objects.class_logits.argmax(dim=-1)
-    hits = [
-        label[scene, match.query] == truth.label[match.target]
-        for scene, (truth, match) in enumerate(zip(targets, matches, strict=True))
-    ]
-    every = torch.cat(hits).float()
-    return every.sum(), every.new_tensor(len(every))
 
 
 class RunningStatistics:
@@ -77,15 +79,29 @@ class RunningStatistics:
     def __init__(self, model: nn.Module) -> None:
         norms = [m for m in model.modules() if isinstance(m, _BatchNorm) and m.training]
         found = [(m.running_mean, m.running_var, m.num_batches_tracked) for m in norms]
-        self._buffers = [buffer for buffers in found for buffer in buffers if buffer is not None]
-        self._backup = [buffer.clone() for buffer in self._buffers]
+        by_dtype: dict[torch.dtype, list[Tensor]] = {}
+        for buffer in (one for buffers in found for one in buffers if one is not None):
+            by_dtype.setdefault(buffer.dtype, []).append(buffer)
+        self._groups = list(by_dtype.values())
+        self._backup = [_joined(group) for group in self._groups]
 
     def save(self) -> None:
         """Back them up."""
-        for saved, buffer in zip(self._backup, self._buffers, strict=True):
-            saved.copy_(buffer)
+        self._backup = [_joined(group) for group in self._groups]
 
-    def restore(self) -> None:
-        """Set them to the backup."""
-        for saved, buffer in zip(self._backup, self._buffers, strict=True):
-            buffer.copy_(saved)
+    def restore(self, where: Tensor | None = None) -> None:
+        """Set them to the backup.
+
+        Args:
+            where: a bool ``()``, whether to; so nobody waits to know it. None: do.
+        """
+        for group, saved in zip(self._groups, self._backup, strict=True):
+            values = saved if where is None else torch.where(where, saved, _joined(group))
+            parts = values.split([buffer.numel() for buffer in group])
+            torch._foreach_copy_(
+                group, [part.view_as(buffer) for part, buffer in zip(parts, group, strict=True)]
+            )
+
+
+def _joined(buffers: Sequence[Tensor]) -> Tensor:
+    return torch.cat([buffer.flatten() for buffer in buffers])

@@ -3,17 +3,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import lightning.pytorch as pl
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.optim import Optimizer
 from torchmetrics import MeanMetric, Metric
 
 from raytran.losses.total import TotalLoss
-from raytran.model import RayTran, inputs_of
+from raytran.model import RayTran, Traced, inputs_of
 from raytran.structs import RawScene, SceneBatch
+from raytran.training.cast_weights import weights_cast_together
+from raytran.training.health_signals import gradient_norms
+from raytran.training.loggers import is_logged_step
 from raytran.training.optim import Optimization
 from raytran.training.ranks import mean_over_ranks
 from raytran.training.scores import SceneScores
@@ -51,6 +57,16 @@ class Reconstruction(pl.LightningModule):
         self.scores = SceneScores(tasks=stage.tasks, metrics=metrics)
         self._compiled = torch.compile(model.forward) if compiled else None
         self._val_losses: dict[str, MeanMetric] = {}
+        self._gradient_norms: dict[str, Tensor] | None = None
+
+    def transfer_batch_to_device(
+        self, batch: SceneBatch, device: torch.device, dataloader_idx: int
+    ) -> SceneBatch:
+        """Return the batch on the device; out of page-locked memory, where loaders put it, without a wait.
+
+        Lightning does so with tensors alone.
+        """
+        return batch.to(device, non_blocking=device.type not in ("cpu", "mps"))
 
     def training_step(self, batch: SceneBatch, batch_idx: int) -> dict[str, Any]:
         """Run the network on a batch and log the terms of the loss, means over all ranks.
@@ -61,22 +77,29 @@ class Reconstruction(pl.LightningModule):
             ``objects``: the last decoder layer's ``RawObjects`` without a graph; None in stages without them.
             Lightning hands all of it to the callbacks' ``on_train_batch_end``.
         """
-        raw = self._run_model(batch)
         several = torch.distributed.is_available() and torch.distributed.is_initialized()
         over_ranks = mean_over_ranks if several else None
-        losses = self._losses(raw, batch, mean_over_ranks=over_ranks)
+        with self._weights_for_a_step():
+            # A step waits for its device once: where queries are matched, and else for the number of pairs.
+            traced = self._trace(batch, wait=not {"objects", "shape"} & set(self.stage.terms))
+            raw = self._run_model(batch, traced._replace(fits=None))
+            losses = self._losses(raw, batch, mean_over_ranks=over_ranks)
+        if traced.fits is not None:
+            # A step that lacks pairs is skipped, like one that is not finite.
+            losses["total"] = torch.where(traced.fits, losses["total"], math.nan)
         means = torch.stack([value.detach() for value in losses.values()])
         if over_ranks is not None:
             means = over_ranks(means)
         logged = dict(zip(losses, means, strict=True))
-        for name, value in logged.items():
-            self.log(f"train/{name}", value, prog_bar=name == "total")
+        # Lightning copies each value twice, also in steps in which none is shown: on a GPU 54 launches.
+        if self.device.type == "cpu" or is_logged_step(self.trainer):
+            self.log_dict({f"train/{name}": value for name, value in logged.items()})
         objects = None if raw.objects is None else raw.objects[-1].detach()
         return {"loss": losses["total"], "losses": logged, "objects": objects}
 
     def validation_step(self, batch: SceneBatch, batch_idx: int) -> None:
         """Collect the losses and the scores, in float32 also under autocast."""
-        raw = self._run_model(batch)
+        raw = self._run_model(batch, self._trace(batch))
         losses = self._losses(raw, batch)
         weight = 0 if self._is_repeated(batch_idx) else len(batch.scene_id)
         for name, value in losses.items():
@@ -94,12 +117,57 @@ class Reconstruction(pl.LightningModule):
         self._val_losses.clear()
 
     def configure_optimizers(self) -> Any:
-        """Return AdamW over what the stage trains, with its schedule."""
-        return self.optimization.build(self.model.parameters(), int(self.trainer.estimated_stepping_batches))
+        """Return AdamW over what the stage trains, with its schedule; fused on a GPU.
 
-    def _run_model(self, batch: SceneBatch) -> RawScene:
+        But not in 16-mixed, whose scaler does not let fused optimisers clip.
+        """
+        scales = getattr(self.trainer.precision_plugin, "scaler", None) is not None
+        fused = self.device.type not in ("cpu", "mps") and not scales
+        steps = int(self.trainer.estimated_stepping_batches)
+        return self.optimization.build(self.model.parameters(), steps, fused=fused)
+
+    def gradient_norms(self) -> dict[str, Tensor]:
+        """Return the norms of the step's gradients by part of the network, and of ``all``; computed once."""
+        if self._gradient_norms is None:
+            self._gradient_norms = gradient_norms(self.model)
+        return self._gradient_norms
+
+    def configure_gradient_clipping(
+        self,
+        optimizer: Optimizer,
+        gradient_clip_val: float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Clip the norm of all gradients; a fused optimiser does it, as it reads them.
+
+        Lightning's own clipping refuses fused optimisers under autocast.
+        """
+        if gradient_clip_algorithm not in (None, "norm"):
+            self.clip_gradients(optimizer, gradient_clip_val, gradient_clip_algorithm)
+        elif gradient_clip_val and self.gradient_norms():
+            norm = self.gradient_norms()["all"]
+            if optimizer.defaults.get("fused"):
+                vars(optimizer)["grad_scale"] = ((norm + 1e-6) / gradient_clip_val).clamp(min=1.0)
+            else:
+                nn.utils.clip_grads_with_norm_(self.model.parameters(), gradient_clip_val, norm)
+        self._gradient_norms = None
+
+    def _trace(self, batch: SceneBatch, *, wait: bool = True) -> Traced:
+        new_cameras = inputs_of(batch)["new_cameras"]
+        return self.model.trace_views(
+            batch.views, grid_center=batch.grid_center, new_cameras=new_cameras, wait=wait
+        )
+
+    def _run_model(self, batch: SceneBatch, traced: Traced | None = None) -> RawScene:
         run = self._compiled or self.model
-        return run(**inputs_of(batch), tasks=self.stage.tasks)
+        return run(**inputs_of(batch), tasks=self.stage.tasks, traced=traced)
+
+    def _weights_for_a_step(self) -> AbstractContextManager[None]:
+        """Cast weights together, where no compiler does that and no block is computed twice."""
+        twice = getattr(self.model.backbone, "checkpoint_blocks", False)
+        if self._compiled is not None or twice:
+            return nullcontext()
+        return weights_cast_together(self.model, self.device.type)
 
     def _losses(self, raw: RawScene, batch: SceneBatch, **options: Any) -> dict[str, Tensor]:
         return self.loss(

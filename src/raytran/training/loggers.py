@@ -42,6 +42,11 @@ def was_logged_step(trainer: Any) -> bool:
     return trainer.global_step % trainer.log_every_n_steps == 0
 
 
+def is_logged_step(trainer: Any) -> bool:
+    """Say, in a step, whether its losses will be shown."""
+    return (trainer.global_step + 1) % trainer.log_every_n_steps == 0
+
+
 class MetricsTable(Logger):
     """One CSV file for a whole run: a resumed run appends to it, without a step that comes twice.
 

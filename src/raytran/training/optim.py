@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any, Literal
 
 from torch import nn
-from torch.optim import AdamW
+from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from raytran.setting_limits import check_settings
@@ -28,6 +28,12 @@ def learning_rate_factor(step: int, *, total_steps: int, warmup_steps: int, deca
         return 1.0
     progress = min(1.0, (step - warmup_steps) / max(1, total_steps - warmup_steps))
     return 0.5 * (1.0 + math.cos(math.pi * progress))
+
+
+def _stay_as_fused(optimizer: Optimizer, state: dict[str, Any]) -> dict[str, Any]:
+    """Return a saved state for this optimiser, also if it was fused where that ran and is not here."""
+    fused = optimizer.defaults["fused"]
+    return state | {"param_groups": [group | {"fused": fused} for group in state["param_groups"]]}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,10 +58,19 @@ class Optimization:
     def __post_init__(self) -> None:
         check_settings(asdict(self))
 
-    def build(self, parameters: Iterable[nn.Parameter], total_steps: int) -> dict[str, Any]:
-        """Return optimiser and schedule for the parameters that train, as Lightning expects them."""
+    def build(
+        self, parameters: Iterable[nn.Parameter], total_steps: int, *, fused: bool = False
+    ) -> dict[str, Any]:
+        """Return optimiser and schedule for the parameters that train, as Lightning expects them.
+
+        Args:
+            parameters: of the network.
+            total_steps: of the schedule.
+            fused: all in few kernels, which also clip (``grad_scale``) and skip a step (``found_inf``).
+        """
         trained = [parameter for parameter in parameters if parameter.requires_grad]
-        optimizer = AdamW(trained, lr=self.learning_rate, weight_decay=self.weight_decay)
+        optimizer = AdamW(trained, lr=self.learning_rate, weight_decay=self.weight_decay, fused=fused)
+        optimizer.register_load_state_dict_pre_hook(_stay_as_fused)
         factor = partial(
             learning_rate_factor, total_steps=total_steps, warmup_steps=self.warmup_steps, decay=self.decay
         )

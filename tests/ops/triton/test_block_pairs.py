@@ -105,9 +105,9 @@ def test_items_cover_every_row_once_and_long_rows_in_pieces(shaped_pairs, monkey
 
 def test_pieces_are_as_short_as_the_slots_allow(monkeypatch):
     monkeypatch.setattr(block_pairs, "_SLOTS", 6)
-    assert block_pairs._piece(torch.tensor([64, 3, 0])) == 64
-    assert block_pairs._piece(torch.tensor([65, 384])) == 128  # 64 would need 2 + 6 slots, 128 needs 3
-    assert block_pairs._piece(torch.tensor([10**7] * 7)) == 2**30
+    assert block_pairs._pieces(torch.tensor([64, 3, 0]))[0] == 64
+    assert block_pairs._pieces(torch.tensor([65, 384]))[0] == 128  # 64 would need 2 + 6 slots, 128 needs 3
+    assert block_pairs._pieces(torch.tensor([10**7] * 7))[0] == 2**30
 
 
 def test_no_pair_at_all():

@@ -11,6 +11,7 @@ import torch
 from raytran.errors import ConfigError, ShapeError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
+from raytran.ops import traverse
 from raytran.ops.pairs import PairList
 from raytran.ops.traverse import RayTracer, trace_pairs
 from raytran.ops.triton.block_pairs import BlockPairs
@@ -143,6 +144,28 @@ def test_every_pair_is_there_however_many_the_step_before_had(random_cameras):
         here = _on_device(cameras, VoxelGrid((side, side, side), (3.0, 3.0, 3.0), center))
         exact = trace_pairs(*here, (4, 16), 1)
         assert len(tracer(*here, (4, 16), 1).index()[0]) == len(exact)
+
+
+def test_pairs_may_be_traced_without_waiting_for_their_number(random_cameras, monkeypatch):
+    """The first ones are waited for; then there is room for twice the most, and it is heard if that lacks."""
+    monkeypatch.setattr(traverse, "_LEAST_ROOM", 0)
+    grid = VoxelGrid((8, 8, 8), (3.0, 3.0, 3.0), torch.zeros(3, dtype=torch.float64))
+    rays = (*_on_device(random_cameras(1, spread=0.1), grid), (4, 16), 1)
+    tracer = RayTracer("fused")
+    exact = tracer.without_waiting(*rays)
+    assert tracer.fits is None
+    tracer._most = dict.fromkeys(tracer._most, len(exact) // 4)  # as if the step before had fewer
+    lacking = tracer.without_waiting(*rays)
+    assert len(lacking) == 2 * (len(exact) // 4) < len(exact)
+    assert not tracer.fits
+    if DEVICE == "cuda":
+        torch.cuda.synchronize()
+    enough = tracer.without_waiting(*rays)
+    assert len(enough) == 2 * len(exact)
+    assert tracer.fits
+    assert torch.equal(torch.stack(enough.index()), torch.stack(exact.index()))
+    assert len(tracer(*rays)) == len(exact)
+    assert tracer.fits is None
 
 
 def test_fused_attention_that_cannot_run_is_refused(random_cameras, monkeypatch):

@@ -6,7 +6,7 @@ import pytest
 from raytran.errors import ConfigError
 from raytran.run.entry import compose
 from raytran.run.train.build import build_trainer, plain
-from raytran.run.train.settings import RunConfig
+from raytran.run.train.settings import RunConfig, does_compile
 from raytran.training.callbacks.stage import StageCallback
 from raytran.training.ranks import SyncedBatchNorm
 
@@ -35,3 +35,11 @@ def test_ranks_share_their_batch_norm_and_look_for_no_unused_parameters(tmp_path
     strategy = trainer(tmp_path, "trainer=ddp_cpu").strategy
     assert isinstance(strategy._layer_sync, SyncedBatchNorm)
     assert not strategy._ddp_kwargs.get("find_unused_parameters", False)
+
+
+def test_compile_is_off_until_it_is_asked_for():
+    assert [does_compile(choice) for choice in ("auto", True, False)] == [False, True, False]
+    assert compose("train", []).compile == "auto"
+    for wrong in ("yes", 1, None):
+        with pytest.raises(ConfigError, match=f"unknown compile={wrong}: choose auto, true or false"):
+            does_compile(wrong)

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from raytran.ops.triton.tiling import PART, PARTS, ROW, Tiling
-from raytran.structs import TensorStruct, cached
+from raytran.structs import TensorStruct, cached, constant, kept_on_device
 
 _SLOTS = 512
 """Slots of scratch memory, for the pieces of long rows."""
@@ -148,13 +148,10 @@ class BlockPairs(TensorStruct):
         return cached(self, "_pixels_per_voxel", self._count_pixels)
 
     def _count_pixels(self) -> Tensor:
-        # Bits are added up in pairs, nibbles, bytes ("Hacker's Delight" §5-1).
-        bits = self.masks[:, 0].long() & 0xFFFFFFFF
-        bits = bits - ((bits >> 1) & 0x55555555)
-        bits = (bits & 0x33333333) + ((bits >> 2) & 0x33333333)
-        bits = (((bits + (bits >> 4)) & 0x0F0F0F0F) * 0x01010101 >> 24) & 0xFF
-        slot = torch.arange(ROW, device=bits.device)
-        voxel = self.voxels.start(self._block)[:, None] + self.voxels.offset(slot)
+        device = self.masks.device
+        number_of = _bits_of_bytes(device=device)
+        bits = number_of[self.masks[:, 0].view(torch.uint8).int()].view(-1, ROW, 4).sum(dim=2)
+        voxel = self.voxels.starts(device)[self._block][:, None] + self.voxels.offsets(device)
         # Slots over the edge of the grid count nothing, wherever that is added.
         voxel = voxel.clamp_(max=max(self.num_voxels - 1, 0))
         return bits.new_zeros(self.num_voxels).index_add_(0, voxel.flatten(), bits.flatten())
@@ -187,51 +184,65 @@ class BlockPairs(TensorStruct):
         """Return the order by ``row`` (K,), whose masks are the first or second of each block pair."""
         # The parts that a row does not touch, those of unused pairs among them, are sorted to the end. The
         # sort is stable, so that the order of every sum is fixed.
-        touched = (self.masks[:, side].view(-1, PARTS, PART) != 0).any(dim=2)
-        row, found = torch.sort(row[:, None].where(touched, rows.num_tiles).flatten(), stable=True)
-        pair, part = found // PARTS, found % PARTS
-        number = torch.arange(rows.num_tiles + 1, device=row.device)
-        offsets = torch.searchsorted(row, number)
-        items, merges = _schedule(offsets, rows.start(number[:-1]))
-        part_start = others.start(other)[pair] + others.offset(part * PART)
-        place = (pair * 2 + side) * PARTS + part
-        return BlockOrder.of(part_start, place, items, merges)
+        device = row.device
+        untouched = (self.masks[:, side].view(-1, PARTS, PART) == 0).all(dim=2)
+        row = row[:, None].expand(-1, PARTS).masked_fill(untouched, rows.num_tiles)
+        row, found = torch.sort(row.flatten(), stable=True)  # found: PARTS · pair + part
+        offsets = torch.searchsorted(row, _count_to(rows.num_tiles + 1, device=device), out_int32=True)
+        part_start = others.starts(device)[other][:, None] + others.offsets(device)[::PART]
+        place = torch.add(found, found // PARTS, alpha=PARTS) + side * PARTS
+        return BlockOrder.of(
+            part_start.flatten()[found], place.int(), *_schedule(offsets, rows.starts(device))
+        )
 
 
 def _schedule(offsets: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
-    """Return ``BlockOrder.items`` and ``.merges`` of rows that begin at ``offsets``."""
-    num_rows, device, lengths = start.shape[0], start.device, offsets.diff()
-    piece = _piece(lengths)
-    pieces = ((lengths + piece - 1) // piece).clamp(min=1)
-    cut = pieces > 1
-    items_before, slots_before = _before(pieces), _before(pieces * cut)
+    """Return ``BlockOrder.items`` and ``.merges``.
 
-    item = torch.arange(num_rows + _SLOTS, device=device)
+    Args:
+        offsets: ``(rows + 1,)`` int32, where rows begin.
+        start: ``(rows + 1,)`` int32, the first element of each, -1 behind the last.
+    """
+    piece, pieces = _pieces(offsets.diff())
+    is_cut = pieces > 1
+    counts = torch.stack([pieces, pieces * is_cut, is_cut]).cumsum(dim=1, dtype=torch.int32)
+    items_before, slots_before, cuts_before = torch.nn.functional.pad(counts, (1, 0))
+    # What is known of each row, and of one more behind them, which unused items and merges are of.
+    ends = torch.stack([start, slots_before, slots_before.roll(-1), items_before, offsets, offsets.roll(-1)])
+
+    item = _count_to(start.shape[0] - 1 + _SLOTS, device=start.device)
+    item = torch.minimum(item, items_before[-1])
     row = torch.searchsorted(items_before[1:], item, right=True)
-    used, row = row < num_rows, row.clamp(max=num_rows - 1)
-    number = item - items_before[row]
-    first = offsets[row] + number * piece
-    last = torch.minimum(first + piece, offsets[row + 1])
-    slot = (slots_before[row] + number).where(cut[row], -1)
-    items = torch.stack([start[row].where(used, -1), first, last, slot], dim=1)
-    longest_first = torch.argsort((last - first).where(used, -1), descending=True, stable=True)
+    first_element, slot, last_slot, first_item, first, end = ends.index_select(1, row)
+    number = item - first_item
+    first = torch.addcmul(first, number, piece)
+    last = torch.minimum(first + piece, end)
+    slot = (slot + number).masked_fill(slot == last_slot, -1)
+    items = torch.stack([first_element, first, last, slot], dim=1)
+    # What is behind the last row ends before it begins: unused items come last.
+    longest_first = torch.argsort(last - first, descending=True, stable=True)
 
-    cuts_before = _before(cut.long())
-    row = torch.searchsorted(cuts_before[1:], torch.arange(_SLOTS // 2, device=device), right=True)
-    used, row = row < num_rows, row.clamp(max=num_rows - 1)
-    merges = torch.stack([start[row].where(used, -1), slots_before[row], slots_before[row + 1]], dim=1)
-    return items[longest_first], merges
+    row = torch.searchsorted(cuts_before[1:], _count_to(_SLOTS // 2, device=start.device), right=True)
+    return items[longest_first], ends[:3].index_select(1, row).T.contiguous()
 
 
-def _piece(lengths: Tensor) -> Tensor:
-    """Return the length of a piece, ``()``, for rows of some lengths."""
-    # Made on the device: to bring the list there would make the host wait.
-    choices = torch.stack([lengths.new_full((), piece) for piece in _PIECES])
-    pieces = (lengths + choices[:, None] - 1) // choices[:, None]
-    slots = pieces.where(pieces > 1, 0).sum(dim=1)
-    return choices[(slots <= _SLOTS).int().argmax()]
+def _pieces(lengths: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the length of a piece, ``(1,)``, and how many pieces each row has, for rows of some lengths."""
+    choices = constant(tuple(_PIECES), torch.int32, device=lengths.device)
+    pieces = (lengths + (choices - 1)[:, None]) // choices[:, None]
+    slots = pieces.masked_fill(pieces <= 1, 0).sum(dim=1)
+    # The slots become fewer from choice to choice.
+    choice = (slots > _SLOTS).sum(dim=0, keepdim=True)
+    return choices.index_select(0, choice), pieces.index_select(0, choice)[0].clamp(min=1)
 
 
-def _before(counts: Tensor) -> Tensor:
-    """Return how many there are before each, and in all, ``(n + 1,)``."""
-    return torch.nn.functional.pad(counts.cumsum(0), (1, 0))
+@kept_on_device(16)
+def _count_to(number: int, *, device: torch.device) -> Tensor:
+    return torch.arange(number, dtype=torch.int32, device=device)
+
+
+@kept_on_device(16)
+def _bits_of_bytes(*, device: torch.device) -> Tensor:
+    """Return how many bits of each byte are set, ``(256,)`` uint8."""
+    byte = torch.arange(256, device=device)[:, None]
+    return ((byte >> torch.arange(8, device=device)) & 1).sum(dim=1, dtype=torch.uint8)

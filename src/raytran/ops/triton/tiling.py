@@ -9,6 +9,8 @@ from math import prod
 import torch
 from torch import Tensor
 
+from raytran.structs import kept_on_device
+
 ROW = 32
 """Elements of a tile or a block: bits of a mask's word."""
 
@@ -87,6 +89,14 @@ class Tiling:
             )
         return tile + at * tile_stride, slot
 
+    def starts(self, device: torch.device) -> Tensor:
+        """Return the first element of every box, and -1 behind them, ``(num_tiles + 1,)`` int32; kept."""
+        return _starts(self, device=device)
+
+    def offsets(self, device: torch.device) -> Tensor:
+        """Return ``offset`` of every slot, ``(32,)`` int32; kept."""
+        return _offsets(self, device=device)
+
     def start(self, tile: Tensor) -> Tensor:
         """Return the first element of each box."""
         at, element, stride = tile, torch.zeros_like(tile), 1
@@ -103,3 +113,14 @@ class Tiling:
             offset = offset + (part % (step // size) * size + inner % size) * stride
             part, inner, stride = part // (step // size), inner // size, stride * self.shape[axis]
         return offset
+
+
+@kept_on_device(16)
+def _starts(tiling: Tiling, *, device: torch.device) -> Tensor:
+    tile = torch.arange(tiling.num_tiles, device=device)
+    return torch.nn.functional.pad(tiling.start(tile), (0, 1), value=-1).int()
+
+
+@kept_on_device(16)
+def _offsets(tiling: Tiling, *, device: torch.device) -> Tensor:
+    return tiling.offset(torch.arange(ROW, device=device)).int()

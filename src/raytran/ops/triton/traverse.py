@@ -59,8 +59,7 @@ def trace_blocks(
     pixels = Tiling.of_pixels(views * feature_size[0] * feature_size[1], (views, *feature_size))
     voxels = Tiling.of_voxels(scenes * grid.num_voxels, (scenes, *grid.resolution))
     slope = direction.reciprocal().masked_fill_(direction == 0, 0.0)
-    tile = torch.arange(pixels.num_tiles, device=origin.device)
-    rays = (origin.contiguous(), slope.contiguous(), slope.float().contiguous()), pixels.start(tile).int()
+    rays = (origin.contiguous(), slope.contiguous(), slope.float().contiguous()), pixels.starts(origin.device)
     with torch.cuda.device_of(origin):
         return _trace(rays, pixels, voxels, rays_per_cell**2, capacity)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import lightning.pytorch as pl
 import torch
 from hydra.utils import instantiate
-from lightning.pytorch.callbacks import EarlyStopping, LearningRateMonitor, ModelCheckpoint, TQDMProgressBar
+from lightning.pytorch.callbacks import EarlyStopping, LearningRateMonitor, ModelCheckpoint
 from omegaconf import DictConfig, OmegaConf
 
 from raytran.checkpoints.file import BEST_NAME
@@ -17,13 +17,13 @@ from raytran.checkpoints.network import without_sources
 from raytran.checkpoints.runs import LAST
 from raytran.errors import ConfigError
 from raytran.run.path_settings import without_references
-from raytran.run.train.settings import RunConfig
+from raytran.run.train.settings import RunConfig, does_compile
 from raytran.training.callbacks.health import Health
 from raytran.training.callbacks.last_checkpoint import BestCheckpoint, LastCheckpoint
 from raytran.training.callbacks.run_checks import EffectiveBatch, RankAgreement, RepeatedFramesWarning
 from raytran.training.callbacks.scene_pictures import ScenePictures
 from raytran.training.callbacks.stage import StageCallback
-from raytran.training.callbacks.step_progress import StepProgress
+from raytran.training.callbacks.step_progress import LossBar, StepProgress
 from raytran.training.callbacks.telemetry import RunSettings, Telemetry
 from raytran.training.checkpoint_io import AtomicCheckpointIO
 from raytran.training.datamodule import SceneDataModule
@@ -71,7 +71,7 @@ def build_module(cfg: DictConfig, model: RayTran) -> Reconstruction:
         loss=instantiate(cfg.loss, _convert_="all"),
         stage=instantiate(cfg.stage, _convert_="all"),
         optimization=instantiate(cfg.optimizer, _convert_="all"),
-        compiled=cfg.compile,
+        compiled=does_compile(cfg.compile),
         metrics=instantiate(cfg.get("metrics", {}), _convert_="all"),
     )
 
@@ -137,7 +137,7 @@ def build_trainer(
     if run.progress_bar == "rich":
         callbacks.append(StepProgress(metadata["stage"]))
     elif run.progress_bar == "tqdm":
-        callbacks.append(TQDMProgressBar())
+        callbacks.append(LossBar())
     loggers = [instantiate(logger, _convert_="all") for logger in plain(cfg.logger).values()]
     return instantiate(
         settings,

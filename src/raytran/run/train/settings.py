@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -14,6 +15,19 @@ from raytran.run.device import check_matmul_precision
 
 PROGRESS_BARS = ("rich", "tqdm", "none")
 PARENT_CHECKS = ("scores", "stage", "none")
+
+
+def does_compile(choice: Any) -> bool:
+    """Return whether the network is compiled.
+
+    ``auto`` leaves it: that a compiled network is right and faster on a GPU has not been measured yet.
+
+    Raises:
+        ConfigError: there is no such choice.
+    """
+    if not isinstance(choice, bool) and choice != "auto":
+        raise ConfigError(f"unknown compile={choice}: choose auto, true or false")
+    return choice is True
 
 
 @dataclass
@@ -31,7 +45,7 @@ class RunConfig:
             ``stage`` only the former, ``none`` nothing.
         resume: ``none``, ``auto``, or the checkpoint of an interrupted run to continue.
         matmul_precision: of float32 products and convolutions, see ``set_matmul_precision``.
-        compile: run the network through ``torch.compile``.
+        compile: run the network through ``torch.compile``: true, false or ``auto``, see ``does_compile``.
         checkpoint_every: optimiser steps between two writings of the last checkpoint.
         progress_bar: ``rich``, ``tqdm`` or ``none``.
         trust: packages of one's own whose classes the network names, see ``trusted_packages``.
@@ -46,7 +60,7 @@ class RunConfig:
     check_parent: str
     resume: str
     matmul_precision: str
-    compile: bool
+    compile: Any
     checkpoint_every: int
     progress_bar: str
     trust: list[str]
@@ -70,6 +84,7 @@ class RunConfig:
                 f"unknown progress_bar={typed.progress_bar}: choose one of {', '.join(PROGRESS_BARS)}"
             )
         check_matmul_precision(typed.matmul_precision)
+        does_compile(typed.compile)
         if typed.check_parent not in PARENT_CHECKS:
             raise ConfigError(
                 f"unknown check_parent={typed.check_parent}: choose one of {', '.join(PARENT_CHECKS)}"

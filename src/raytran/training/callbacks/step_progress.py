@@ -7,6 +7,7 @@ import logging
 from typing import Any
 
 import lightning.pytorch as pl
+from lightning.pytorch.callbacks import TQDMProgressBar
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -17,10 +18,28 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from raytran.training.loggers import was_logged_step
+
 _log = logging.getLogger(__name__)
 
 _LINES = 10
 """Lines per fit where there is no terminal to draw a bar on."""
+
+
+class LossBar(TQDMProgressBar):
+    """Lightning's bar with the loss of the last step that was logged."""
+
+    _shown = ""
+
+    def on_train_batch_end(self, trainer: pl.Trainer, *rest: Any) -> None:
+        """Take the loss."""
+        if was_logged_step(trainer):
+            self._shown = _loss(trainer)
+        super().on_train_batch_end(trainer, *rest)
+
+    def get_metrics(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> dict[str, Any]:
+        """Return what the bar shows."""
+        return super().get_metrics(trainer, pl_module) | {"loss": self._shown.removeprefix("loss ")}
 
 
 class StepProgress(pl.Callback):
@@ -56,7 +75,9 @@ class StepProgress(pl.Callback):
     def on_train_batch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule, *_: Any) -> None:
         """Show the steps done and the loss."""
         if self._bar is not None:
-            self._bar.update(self._task, completed=trainer.global_step, loss=_loss(trainer))
+            self._bar.update(self._task, completed=trainer.global_step)
+            if was_logged_step(trainer):  # to ask for the loss of every step would wait for the device
+                self._bar.update(self._task, loss=_loss(trainer))
         elif trainer.is_global_zero and trainer.global_step - self._shown_at >= max(
             1, trainer.max_steps // _LINES
         ):
@@ -77,5 +98,5 @@ def _total(trainer: pl.Trainer) -> int | None:
 
 
 def _loss(trainer: pl.Trainer) -> str:
-    loss = trainer.progress_bar_metrics.get("train/total")
-    return "" if loss is None else f"loss {loss:.4g}"
+    loss = trainer.callback_metrics.get("train/total")
+    return "" if loss is None else f"loss {float(loss):.4g}"
