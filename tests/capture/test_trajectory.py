@@ -11,7 +11,15 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from raytran.capture.recording import open_recording
-from raytran.capture.trajectory import in_seconds, is_tum, poses_at, read_camera, read_track, read_tum
+from raytran.capture.trajectory import (
+    in_seconds,
+    is_tum,
+    poses_at,
+    read_camera,
+    read_track,
+    read_tum,
+    rotations,
+)
 from raytran.errors import DataError
 
 from .forms import check_frames, tum_line, words, write_tum
@@ -368,3 +376,11 @@ def test_images_without_a_time_and_damaged_lines_are_left_out(walk, tmp_path, ca
     (folder / "rgb.txt").write_text("\n".join(["time file", *rows]))
     check_frames(open_recording(read_tum(folder)), walk, [n for n in range(12) if n != 4])
     assert "1 of 12 lines are damaged and left out" in caplog.text
+
+
+def test_numbers_beyond_all_quaternions_are_lost_poses_without_a_warning(recwarn):
+    quaternions = np.array(
+        [[0.0, 0, 0, 1], [1e300, 0, 0, 1], [np.nan, 0, 0, 1], [0.1, 0, 0, 1.05], [0, 0, 0, 0]]
+    )
+    assert np.isfinite(rotations(quaternions)).all(axis=(1, 2)).tolist() == [True, False, False, True, False]
+    assert not recwarn.list

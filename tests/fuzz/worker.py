@@ -121,10 +121,18 @@ def _memory(name: str) -> float:
 
 
 def make(kind: Input, number: int, seed: int, folder: Path) -> None:
-    """Write input ``number`` to a folder, which is emptied first."""
+    """Write input ``number`` to a folder, which is emptied first.
+
+    A few mutations are such as no file can hold: lists that contain themselves, or a hundred million numbers.
+    Then the input stays undamaged.
+    """
     shutil.rmtree(folder, ignore_errors=True)
     kind.write(folder)
-    kind.mutate(folder, random.Random(f"{seed} {number}"))
+    try:
+        kind.mutate(folder, random.Random(f"{seed} {number}"))
+    except (MemoryError, RecursionError, ValueError):
+        shutil.rmtree(folder, ignore_errors=True)
+        kind.write(folder)
 
 
 def judge(kind: Input, number: int, seed: int, folder: Path, watch: Watch) -> Verdict:

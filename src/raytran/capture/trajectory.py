@@ -147,8 +147,10 @@ def _as_floats(words: Sequence[str]) -> list[float]:
 
 def rotations(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return ``(n, 3, 3)`` of quaternions ``[x, y, z, w]``; not finite where one is far from length one."""
-    length = np.linalg.norm(quaternions, axis=1)
-    is_unit = np.isfinite(length) & (np.abs(length - 1) < 0.1)
+    # Larger numbers than any of a unit quaternion may overflow when they are squared.
+    is_small = (np.abs(quaternions) < 2).all(axis=1, keepdims=True)
+    length = np.linalg.norm(np.where(is_small, quaternions, 0.0), axis=1)
+    is_unit = np.abs(length - 1) < 0.1
     matrices = np.full((len(quaternions), 3, 3), np.nan)
     if is_unit.any():
         matrices[is_unit] = Rotation.from_quat(quaternions[is_unit]).as_matrix()
