@@ -169,12 +169,10 @@ def kept_on_device(most: int) -> Callable[[_Make], _Make]:
             with torch.inference_mode(False), torch.no_grad():
                 return make(*values, device=device)
 
-        @wraps(make)
-        def call(*values: Any, device: torch.device) -> Any:
-            at_once = device.type == "cpu" or torch.compiler.is_compiling()
-            return (make if at_once else kept)(*values, device=device)
-
-        return cast("_Make", call)
+        call = lambda *values, device: (  # noqa: E731
+            make if device.type == "cpu" or torch.compiler.is_compiling() else kept
+        )(*values, device=device)
+        return cast("_Make", wraps(make)(call))
 
     return decorate
 

@@ -83,7 +83,14 @@ class VoxelGrid:
         return (index[..., 0] * y + index[..., 1]) * z + index[..., 2]
 
     def _vector(self, values: tuple[float, ...]) -> Tensor:
-        return constant(values, self.center.dtype, device=self.center.device)
+        return _numbers(values, self.center)
+
+
+def _numbers(values: Sequence[float], like: Tensor) -> Tensor:
+    """Return fixed numbers as a vector, made so that no GPU is waited for."""
+    if like.is_cpu:
+        return torch.stack([like.new_full((), value) for value in values])
+    return constant(tuple(values), like.dtype, device=like.device)
 
 
 def checked_grid(
@@ -125,7 +132,7 @@ def position_code(points: Tensor, extent: Sequence[float], channels: int) -> Ten
     count = channels // 6
     if points.is_cpu:
         cycles = _cycles(count, points.dtype, device=points.device)
-        sides = constant(tuple(extent), points.dtype, device=points.device)
+        sides = _numbers(extent, points)
         angle = (2 * math.pi * points / sides)[..., None] * cycles
         code = torch.cat([angle.sin(), angle.cos()], dim=-1).flatten(-2)
     else:

@@ -6,11 +6,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import cast
 
+import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from raytran.errors import ConfigError
-from raytran.ops.norms import in_product_dtype
 
 
 class DecoderLayer(nn.Module):
@@ -77,6 +77,12 @@ class DecoderLayer(nn.Module):
         located = in_product_dtype(self.voxel_norm(queries)) + position
         queries = queries + self.voxel_attention(located, reference, memory, voxel_position)
         return queries + self.feed_forward(queries)
+
+
+def in_product_dtype(x: Tensor) -> Tensor:
+    """Return ``x`` as autocast's products take it: cast once for all that read it."""
+    kind = x.device.type
+    return x.to(torch.get_autocast_dtype(kind)) if torch.is_autocast_enabled(kind) else x
 
 
 class SelfAttention(nn.MultiheadAttention):

@@ -15,8 +15,7 @@ from torch.quasirandom import SobolEngine
 from raytran.errors import ConfigError
 from raytran.geometry.grid import VoxelGrid, centered_voxels, position_code, voxel_code
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.heads.decoder import DecoderLayer
-from raytran.ops.norms import in_product_dtype
+from raytran.heads.decoder import DecoderLayer, in_product_dtype
 from raytran.structs import CLASSES, PADDING, ObjectSet, RawObjects, RawProposals
 
 QUERY_SCALE = 0.1

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.modules.conv import _ConvNd
 
-from raytran.ops.norms import LayerNorm
+from raytran.backbone.block import LayerNorm
 
 _CAST = (nn.Linear, _ConvNd, nn.MultiheadAttention, LayerNorm)
 """Modules that autocast runs in 16 bits, and norms that follow their input."""
@@ -26,14 +26,11 @@ _OURS = ("raytran.model", "raytran.backbone.", "raytran.heads.")
 
 @contextmanager
 def weights_cast_together(model: nn.Module, device_type: str) -> Iterator[None]:
-    """Let the modules of ``model`` find 16-bit weights in this block, if autocast is on; else do nothing.
+    """Let the modules of ``model`` find weights in autocast's 16 bits in this block.
 
     The gradients of each part, encoder, backbone or heads, come to their weights together: between ranks they
     travel while those of the parts before are computed.
     """
-    if not torch.is_autocast_enabled(device_type):
-        yield
-        return
     dtype = torch.get_autocast_dtype(device_type)
     # Frozen weights apart: of what is cast with one that learns, gradients are computed.
     parts: dict[tuple[str, bool], list[tuple[nn.Module, str, nn.Parameter]]] = {}
@@ -57,7 +54,7 @@ def _under_autocast(owner: nn.Module, path: str) -> Iterator[tuple[str, nn.Modul
     """Yield path and module of all that are cast."""
     for name, module in owner.named_children():
         kind = type(module).__module__
-        if kind.startswith((*_OURS, "torch.nn.", LayerNorm.__module__)):
+        if kind.startswith((*_OURS, "torch.nn.")):
             if isinstance(module, _CAST):
                 yield path + name, module
             yield from _under_autocast(module, f"{path}{name}.")

@@ -93,7 +93,8 @@ class Reconstruction(pl.LightningModule):
         logged = dict(zip(losses, means, strict=True))
         # Lightning copies each value twice, also in steps in which none is shown: on a GPU 54 launches.
         if self.device.type == "cpu" or is_logged_step(self.trainer):
-            self.log_dict({f"train/{name}": value for name, value in logged.items()})
+            for name, value in logged.items():
+                self.log(f"train/{name}", value)
         objects = None if raw.objects is None else raw.objects[-1].detach()
         return {"loss": losses["total"], "losses": logged, "objects": objects}
 
@@ -163,9 +164,9 @@ class Reconstruction(pl.LightningModule):
         return run(**inputs_of(batch), tasks=self.stage.tasks, traced=traced)
 
     def _weights_for_a_step(self) -> AbstractContextManager[None]:
-        """Cast weights together, where no compiler does that and no block is computed twice."""
+        """Cast weights together under autocast, where no compiler does and no block is computed twice."""
         twice = getattr(self.model.backbone, "checkpoint_blocks", False)
-        if self._compiled is not None or twice:
+        if not torch.is_autocast_enabled(self.device.type) or self._compiled is not None or twice:
             return nullcontext()
         return weights_cast_together(self.model, self.device.type)
 
