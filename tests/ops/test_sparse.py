@@ -30,7 +30,7 @@ def test_against_dense_matrices(random_pairs, generator, side):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("density", [0.0, 0.3])
 def test_weighted_sums_of_any_width(random_pairs, generator, channels, dtype, density):
-    """Whatever loop torch has for the width and the type: a sum that leaves nothing out, the same every time."""
+    """Whatever loop torch has for the width and the type, it leaves nothing out and repeats itself."""
     pairs = random_pairs(40, 30, density)
     values = torch.randn(len(pairs), generator=generator, dtype=dtype)
     cols = torch.randn(30, channels, generator=generator, dtype=dtype)
