@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 
@@ -96,3 +97,15 @@ def test_compose_is_what_the_command_line_would_compose():
 )
 def test_words_without_a_key_get_one(typed, meant):
     assert name_positional(typed, "file") == meant
+
+
+@pytest.mark.parametrize(
+    ("typed", "expected"),
+    [({}, "10000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "active"}, "None")],
+)
+def test_threads_of_a_command_do_not_spin_long_unless_they_are_told_to(typed, expected):
+    """OpenMP reads it when torch is imported, which no command may do before."""
+    code = "import os, sys, raytran.predict; print(os.environ.get('GOMP_SPINCOUNT'), 'torch' in sys.modules)"
+    kept = {k: v for k, v in os.environ.items() if k not in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")}
+    said = subprocess.run([sys.executable, "-c", code], env=kept | typed, capture_output=True, text=True)
+    assert said.stdout.split() == [expected, "False"], said.stderr
