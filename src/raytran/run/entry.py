@@ -90,7 +90,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
 
 
 def _let_threads_sleep() -> None:
-    """Let torch's OpenMP threads wait for each other about 0.1 ms and not for several; before torch is imported.
+    """Let torch's OpenMP threads wait for each other 0.1 ms and not several; before torch is imported.
 
     As soon as anything else wants the cores, threads that spin take them from those that they wait for: with
     as many other processes as cores, a prediction used two and a half times the processor time.
