@@ -21,9 +21,8 @@ $(VENV)/.installed: pyproject.toml requirements/ci.txt
 	$(BIN)/pip install --quiet --no-deps --editable .
 	@touch $@
 
-# OpenMP threads spin long while they wait for each other, which crawls as soon as anything else wants the cores.
 demo: install  ## Make rooms, train the three stages, evaluate, predict, and write one page to look at (CPU, minutes)
-	GOMP_SPINCOUNT=10000 $(BIN)/python -m raytran.demo
+	$(BIN)/python -m raytran.demo
 
 test: install  ## Run all tests but those of the night
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal -m 'not nightly'

@@ -12,7 +12,7 @@ from raytran.checkpoints.file import BEST_NAME, read_checkpoint
 from raytran.checkpoints.runs import LAST, read_finished
 from raytran.errors import ConfigError
 from raytran.run.entry import compose
-from raytran.run.train.build import build_trainer, plain
+from raytran.run.train.build import build_data, build_trainer, plain
 from raytran.run.train.settings import RunConfig
 from raytran.training.callbacks.stage import StageCallback
 from raytran.training.lightning_module import Reconstruction
@@ -79,6 +79,36 @@ def test_a_run_that_gets_no_better_ends(tmp_path, six_steps, scored, caplog):
     assert "stage2 may start from it" in caplog.text
 
 
+@pytest.mark.parametrize(
+    ("mode", "threshold", "steps"),
+    [("max", "0.35", 4), ("max", "0.5", 6), ("max", "0.4", 6), ("min", "0.15", 1)],
+)
+def test_a_run_that_is_good_enough_ends(tmp_path, six_steps, scored, mode, threshold, steps):
+    """At the first validation whose score is beyond the threshold, not at it."""
+    scored(0.1, 0.3, 0.2, 0.4, 0.1, 0.2)
+    settings = [f"optimized_mode={mode}", f"early_stopping.threshold={threshold}"]
+    assert fit(six_steps, tmp_path, *settings).steps == steps
+
+
+def test_a_run_that_is_good_enough_or_gets_no_better_ends(tmp_path, six_steps, scored):
+    scored(0.1, 0.3, 0.2, 0.2, 0.1, 0.9)
+    settings = ["early_stopping.threshold=0.8", "early_stopping.patience=2"]
+    assert fit(six_steps, tmp_path, *settings).steps == 4
+
+
+def test_validations_may_score_the_training_scenes(settings):
+    """All of them, in the order of their list, from frames that are always the same."""
+    fixed = [*settings, "experiment=stage1", "output_dir=none"]
+    of_split = {}
+    for split in ("train", "val"):
+        data = build_data(compose("train", [*fixed, f"data.val_split={split}"]))
+        first, again = list(data.val_dataloader()), list(data.val_dataloader())
+        assert [batch.frame_id for batch in first] == [batch.frame_id for batch in again]
+        of_split[split] = [batch.scene_id[0] for batch in first]
+        assert of_split[split] == list(data.split(split).scene_ids)
+    assert not set(of_split["train"]) & set(of_split["val"])
+
+
 def test_a_run_that_has_not_learned_says_that_the_next_stage_will_refuse(tmp_path, six_steps, scored, caplog):
     scored(*[0.01] * 6)
     with caplog.at_level(logging.INFO, "raytran"):
@@ -104,6 +134,8 @@ def test_a_score_that_no_validation_has_ends_no_run(tmp_path, six_steps, caplog,
     [
         ("optimized_mode=best", "unknown optimized_mode=best: choose max or min"),
         ("early_stopping.patience=-1", "must be a number of validations or 0 for never, got -1"),
+        ("early_stopping.threshold=high", "threshold must be a number or null for none, got high"),
+        ("early_stopping.threshold=true", "threshold must be a number or null for none, got True"),
     ],
 )
 def test_settings_without_a_meaning(tmp_path, setting, said):

@@ -8,10 +8,12 @@ from typing import Any
 
 import pytest
 import torch
+import torch.nn.functional as F
+from torch import nn
 
 from raytran.errors import CheckpointError, ConfigError
 from raytran.extensions import efficientnet
-from raytran.extensions.efficientnet import EfficientNetLite0
+from raytran.extensions.efficientnet import EfficientNetLite0, SameConv2d
 
 
 @pytest.fixture(scope="module")
@@ -136,6 +138,46 @@ def test_a_frozen_network_stays_as_it_is() -> None:
     assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
     with pytest.raises(ConfigError, match="mask"):
         EfficientNetLite0(stride=8, frozen=True, input_channels=4)
+
+
+@pytest.mark.parametrize("stride", [8, 16])
+def test_norms_that_are_part_of_convolutions_change_nothing(stride: int) -> None:
+    """The same weights, frozen and not: without gradients, with them, and layer by layer in float64."""
+    torch.manual_seed(0)
+    frozen, trained = (
+        EfficientNetLite0(stride=stride, num_stages=5, frozen=frozen) for frozen in (True, False)
+    )
+    for norm in (module for module in frozen.modules() if isinstance(module, nn.BatchNorm2d)):
+        for value, low, high in (
+            *((norm.running_mean, -0.3, 0.3), (norm.running_var, 0.5, 2.0)),
+            *((norm.weight, 0.5, 1.5), (norm.bias, -0.5, 0.5)),
+        ):
+            value.data.uniform_(low, high)
+    trained.load_state_dict(frozen.state_dict())
+    images = torch.randn(2, 3, 48, 64)
+    with_gradient = trained.eval()(images)
+    assert with_gradient.requires_grad
+    with torch.no_grad():
+        without = trained(images)
+    torch.testing.assert_close(frozen(images), without, rtol=0, atol=0)
+    exact = EfficientNetLite0(stride=stride, num_stages=5).double().eval()
+    exact.load_state_dict(frozen.state_dict())
+    for found in (with_gradient, without):
+        torch.testing.assert_close(found.double(), exact(images.double()), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "stride", "dilation"), [(3, 2, 1), (5, 2, 1), (3, 1, 1), (5, 1, 2), (1, 1, 1)]
+)
+def test_padding_is_tensorflows(kernel: int, stride: int, dilation: int) -> None:
+    """As many outputs as steps fit, and of an odd number of zeros the larger half at the end."""
+    layer = SameConv2d(2, 3, kernel, stride=stride, dilation=dilation)
+    images = torch.randn(1, 2, 8, 12)
+    total = dilation * (kernel - 1) + 1 - stride
+    padded = F.pad(images, [total // 2, total - total // 2] * 2)
+    expected = F.conv2d(padded, layer.weight, stride=stride, dilation=dilation)
+    assert expected.shape == (1, 3, 8 // stride, 12 // stride)
+    torch.testing.assert_close(layer(images), expected)
 
 
 def test_strides_are_checked() -> None:

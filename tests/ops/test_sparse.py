@@ -24,3 +24,18 @@ def test_against_dense_matrices(random_pairs, generator, side):
     torch.testing.assert_close(sparse_product(values, cols, order), matrix @ cols)
     torch.testing.assert_close(segment_sum(values, order), matrix.sum(dim=1))
     torch.testing.assert_close(segment_max(values, order), matrix.masked_fill(~mask, -torch.inf).amax(dim=1))
+
+
+@pytest.mark.parametrize("channels", [1, 5, 12, 32, 100])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("density", [0.0, 0.3])
+def test_weighted_sums_of_any_width(random_pairs, generator, channels, dtype, density):
+    """Whatever loop torch has for the width and the type, it leaves nothing out and repeats itself."""
+    pairs = random_pairs(40, 30, density)
+    values = torch.randn(len(pairs), generator=generator, dtype=dtype)
+    cols = torch.randn(30, channels, generator=generator, dtype=dtype)
+    matrix = torch.zeros(40, 30, dtype=dtype)
+    matrix[pair_mask(pairs)] = values
+    found = sparse_product(values, cols, pairs.by("pixels"))
+    torch.testing.assert_close(found, matrix @ cols)
+    assert torch.equal(found, sparse_product(values, cols, pairs.by("pixels")))

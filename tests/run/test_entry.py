@@ -172,3 +172,15 @@ def test_numbers_that_are_one_value_are_no_sweep(typed, meant):
 def test_a_direction_as_typed_reaches_the_command():
     cfg = compose("predict", ["scene=a", "output=b", *with_number_lists(["up=0.1,-0.2,+1"])])
     assert list(cfg.up) == [0.1, -0.2, 1]
+
+
+@pytest.mark.parametrize(
+    ("typed", "expected"),
+    [({}, "10000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "active"}, "None")],
+)
+def test_threads_of_a_command_do_not_spin_long_unless_they_are_told_to(typed, expected):
+    """OpenMP reads it when torch is imported, which no command may do before."""
+    code = "import os, sys, raytran.predict; print(os.environ.get('GOMP_SPINCOUNT'), 'torch' in sys.modules)"
+    kept = {k: v for k, v in os.environ.items() if k not in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")}
+    said = subprocess.run([sys.executable, "-c", code], env=kept | typed, capture_output=True, text=True)
+    assert said.stdout.split() == [expected, "False"], said.stderr

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ray-traced attention over a pair list as an operator of torch, out of ``torch.sparse`` products.
+"""Ray-traced attention over a pair list as an operator of torch, out of products of sparse matrices.
 
 No score of a pair that no ray joins is ever computed. The exponentials of the scores, ``H · P`` numbers, are
 all of the pairs' size that is kept for the backward pass. It needs no atomic addition: the sums over targets
@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from raytran.ops.pairs import PairOrder
@@ -177,11 +178,18 @@ def sampled_product(rows: Tensor, cols: Tensor, order: PairOrder) -> Tensor:
 
 def sparse_product(values: Tensor, cols: Tensor, order: PairOrder) -> Tensor:
     """Return the sum over each row of its pairs' columns times their values: ``(P,), (S, D) -> (R, D)``."""
-    matrix = _matrix(values, order, cols.shape[0])
     if cols.device.type == "cpu":
-        # With a named reduction torch runs its own vectorised loop, several times faster than MKL's.
-        return torch.sparse.mm(matrix, cols, "sum")
-    return torch.sparse.mm(matrix, cols)
+        # A sum of rows of a table by index, weighted: what embeddings of words are read with. Its loop is
+        # compiled for the number of columns, and is several times faster than any product of torch.sparse.
+        return F.embedding_bag(
+            order.col_index,
+            cols,
+            order.row_offsets,
+            mode="sum",
+            per_sample_weights=values,
+            include_last_offset=True,
+        )
+    return torch.sparse.mm(_matrix(values, order, cols.shape[0]), cols)
 
 
 def _matrix(values: Tensor, order: PairOrder, num_cols: int) -> Tensor:

@@ -46,6 +46,7 @@ class SceneDataModule(pl.LightningDataModule):
             there in any case.
         num_views: frames of a training scene, drawn at random anew each time.
         val_views: frames of a validation scene, evenly spread.
+        val_split: the split whose scenes validations score; ``train`` tells what has been learned by heart.
         batch_size: scenes per device.
         num_workers: loader processes.
         augmentation: random changes of training scenes; validation scenes are never changed.
@@ -65,6 +66,7 @@ class SceneDataModule(pl.LightningDataModule):
         make: Callable[..., Any] | None = None,
         num_views: int = 20,
         val_views: int = 20,
+        val_split: str = "val",
         batch_size: int = 1,
         num_workers: int = 2,
         augmentation: Augmentation | None = None,
@@ -88,6 +90,7 @@ class SceneDataModule(pl.LightningDataModule):
         self._make = make
         self._num_views = num_views
         self._val_views = val_views
+        self._val_split = val_split
         self._batch_size = batch_size
         self._num_workers = num_workers
         self._augmentation = augmentation
@@ -140,7 +143,7 @@ class SceneDataModule(pl.LightningDataModule):
 
         On several ranks a few come twice, to make them even; the module counts them once.
         """
-        dataset = self.split("val")
+        dataset = self.split(self._val_split)
         return self._loader(dataset, DistributedSampler(dataset, **self._ranks(), shuffle=False), 1)
 
     def _loader(

@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from raytran.checkpoints.file import shipped_weights, write_checkpoint
 from raytran.checkpoints.metadata import checkpoint_metadata
+from raytran.checkpoints.runs import read_finished
 from raytran.data.locks import exclusive_lock
 from raytran.errors import ConfigError
 from raytran.run.demo.demo import _asked, demo
@@ -36,7 +37,8 @@ FEW = [
 
 def config(output, *more: str) -> DictConfig:
     values = {"preset": "tiny", "overrides": [*FEW, *more], "score_threshold": 0.5, "duplicate_iou": 0.25}
-    return OmegaConf.create({"output": str(output), **values})
+    learned = {"stage1": 0.0, "stage2": 0.999, "stage3": None}
+    return OmegaConf.create({"output": str(output), "validate_every": 1, "learned": learned, **values})
 
 
 def test_a_network_of_ones_own_is_trusted_because_it_was_typed(tmp_path, mylab):
@@ -77,6 +79,11 @@ def test_demo_from_nothing_to_a_page_and_again(tmp_path, caplog, capsys):
         written = json.loads((output / "evaluation" / split / "metrics.json").read_text())
         assert written["strict"] == first.metrics[split]["strict"]
         assert json.loads((output / "predictions" / scene / "scene.json").read_text())["scene_id"] == scene
+    steps = {
+        stage: read_finished(output / "training" / stage).steps for stage in ("stage1", "stage2", "stage3")
+    }
+    assert steps == {"stage1": 1, "stage2": 2, "stage3": 2}, "a stage ends when its rooms are learned"
+    assert first.metrics["train"]["strict"]["n_scenes"] == 1
     assert set(first.seconds) >= {"rooms", "training, stage1", "training, stage3", "evaluation", "prediction"}
 
     again = demo(config(output))
@@ -87,3 +94,7 @@ def test_demo_from_nothing_to_a_page_and_again(tmp_path, caplog, capsys):
 
     with pytest.raises(ConfigError, match="other settings"):
         demo(config(output, "schedule.stage2.steps=3"))
+    other = config(output)
+    other.learned.stage2 = 0.5
+    with pytest.raises(ConfigError, match="other settings"):
+        demo(other)

@@ -107,11 +107,11 @@ def demo(cfg: DictConfig) -> DemoResult:
 def _demo(cfg: DictConfig, output: Path) -> DemoResult:
     """Make the demo in a folder that nobody else writes."""
     overrides = [f"preset={cfg.preset}", f"data.root={quoted(output / 'rooms')}", *plain(cfg.overrides)]
-    data = _data(overrides, output)
+    data = _data(cfg, overrides, output)
     times = StepTimes(output / "times.json")
     with times.measure("rooms", continues=True):
         data.prepare_data()
-    fits = _train(overrides, output / "training", times)
+    fits = _train(cfg, overrides, output / "training", times)
     asked = _asked(overrides, data, fits[-1].checkpoint)
     with times.measure("evaluation"):
         metrics = {name: _evaluate(cfg, part, output / "evaluation" / name) for name, part in asked.items()}
@@ -123,7 +123,7 @@ def _demo(cfg: DictConfig, output: Path) -> DemoResult:
     return DemoResult(page, metrics, times.seconds)
 
 
-def _data(overrides: Sequence[str], output: Path) -> SceneDataModule:
+def _data(demo_cfg: DictConfig, overrides: Sequence[str], output: Path) -> SceneDataModule:
     """Return the rooms, with all targets that are measured and the views that a prediction takes.
 
     Raises:
@@ -132,7 +132,7 @@ def _data(overrides: Sequence[str], output: Path) -> SceneDataModule:
     cfg = compose("train", [*overrides, *_SETTINGS, f"output_dir={quoted(output)}"])
     wanted = {
         name: value if isinstance(value := cfg[name], str | int) else plain(value) for name in _RECORDED
-    }
+    } | {name: plain(demo_cfg)[name] for name in ("validate_every", "learned")}
     if SettingsRecord(output / _RECORD).begin(wanted):
         raise ConfigError(
             f"{output} holds a demo with other settings: delete it or give output=ANOTHER_FOLDER"
@@ -140,8 +140,17 @@ def _data(overrides: Sequence[str], output: Path) -> SceneDataModule:
     return build_data(cfg)
 
 
-def _train(overrides: Sequence[str], folder: Path, times: StepTimes) -> list[FitResult]:
-    fits = run_curriculum(overrides, output_dir=folder)
+def _train(cfg: DictConfig, overrides: Sequence[str], folder: Path, times: StepTimes) -> list[FitResult]:
+    """Train each stage until the training rooms are learned."""
+    validation = ["data.val_split=train", "data.val_views=${views.predict_views}", "watch.pictures=0"]
+    of_stage = {
+        stage: [
+            f"schedule.{stage}.validate_every={cfg.validate_every}",
+            f"early_stopping.threshold={'null' if learned is None else learned}",
+        ]
+        for stage, learned in plain(cfg.learned).items()
+    }
+    fits = run_curriculum([*validation, *overrides], output_dir=folder, of_stage=of_stage)
     for fit in fits:
         # A stage that had finished before took no time now; its entry is there already.
         if fit.seconds:

@@ -144,8 +144,9 @@ def _training(output: Path, fits: Sequence[FitResult]) -> dict[str, Any]:
     curves = draw_curves(output / "pictures" / "curves.png", histories)
     return {
         "title": "Training",
-        "text": f"Three fits, one after another, of {steps} steps: first what is occupied, then everything "
-        "but the shapes, then the shapes alone while the rest is frozen.",
+        "text": f"Three fits, one after another, of {steps} steps, each until the training rooms are learned "
+        "or its steps used up: first what is occupied, then everything but the shapes, then the shapes alone "
+        "while the rest is frozen.",
         "pictures": [
             _picture(curves, "Terms of the loss against steps: running mean and single values.", wide=True)
         ],

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -156,7 +157,8 @@ def _judges(cfg: DictConfig, folder: Path) -> list[pl.Callback]:
     Raises:
         ConfigError: a setting has no meaning.
     """
-    metric, mode, patience = cfg.optimized_metric, cfg.optimized_mode, cfg.early_stopping.patience
+    metric, mode = cfg.optimized_metric, cfg.optimized_mode
+    patience, threshold = cfg.early_stopping.patience, cfg.early_stopping.threshold
     if metric is None:
         return []
     if mode not in ("max", "min"):
@@ -165,6 +167,8 @@ def _judges(cfg: DictConfig, folder: Path) -> list[pl.Callback]:
         raise ConfigError(
             f"early_stopping.patience must be a number of validations or 0 for never, got {patience}"
         )
+    if threshold is not None and (isinstance(threshold, bool) or not isinstance(threshold, int | float)):
+        raise ConfigError(f"early_stopping.threshold must be a number or null for none, got {threshold}")
     best = BestCheckpoint(
         dirpath=(folder / LAST).parent,
         filename=Path(BEST_NAME).stem,
@@ -173,10 +177,15 @@ def _judges(cfg: DictConfig, folder: Path) -> list[pl.Callback]:
         enable_version_counter=False,
         save_on_train_epoch_end=False,
     )
-    if not patience:
+    if not patience and threshold is None:
         return [best]
     stopping = EarlyStopping(
-        metric, mode=mode, patience=patience, strict=False, check_on_train_epoch_end=False
+        metric,
+        mode=mode,
+        patience=patience or sys.maxsize,
+        stopping_threshold=threshold,
+        strict=False,
+        check_on_train_epoch_end=False,
     )
     return [best, stopping]
 

@@ -8,7 +8,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
@@ -39,7 +39,11 @@ def curriculum(cfg: DictConfig) -> list[FitResult]:
 
 
 def run_curriculum(
-    overrides: Sequence[str], *, output_dir: Path, stages: Sequence[str] = STAGES
+    overrides: Sequence[str],
+    *,
+    output_dir: Path,
+    stages: Sequence[str] = STAGES,
+    of_stage: Mapping[str, Sequence[str]] | None = None,
 ) -> list[FitResult]:
     """Train the stages in turn, each from the weights of the one before.
 
@@ -50,6 +54,7 @@ def run_curriculum(
         overrides: settings for all stages as typed after ``python -m raytran.train``, without ``experiment``.
         output_dir: folder of the curriculum.
         stages: experiments, in order.
+        of_stage: settings of single stages, by experiment, that win over ``overrides``.
 
     Raises:
         ConfigError: ``overrides`` names an experiment, there is no such setting or stage, or the folder holds
@@ -73,7 +78,14 @@ def _train_stages(
     for number, experiment in enumerate(stages, start=1):
         _log.info("stage %d of %d: experiment=%s", number, len(stages), experiment)
         folder = output_dir / experiment
-        settings = [*overrides, f"experiment={experiment}", f"output_dir={quoted(folder)}", "resume=auto"]
+        own = (of_stage or {}).get(experiment, ())
+        settings = [
+            *overrides,
+            *own,
+            f"experiment={experiment}",
+            f"output_dir={quoted(folder)}",
+            "resume=auto",
+        ]
         if results:
             settings.append(f"init_from={quoted(results[-1].checkpoint)}")
         results.append(_fit(settings, folder))
