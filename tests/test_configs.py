@@ -278,6 +278,15 @@ def settings_of_all_commands(project_root):
     return known
 
 
+def texts_in(node: ast.AST) -> list[str]:
+    """Return the texts in a piece of code, with ``{}`` for what is put into them."""
+    if isinstance(node, ast.JoinedStr):
+        return ["".join(part.value if isinstance(part, ast.Constant) else "{}" for part in node.values)]
+    if isinstance(node, ast.Constant):
+        return [node.value] if isinstance(node.value, str) else []
+    return [text for child in ast.iter_child_nodes(node) for text in texts_in(child)]
+
+
 def test_settings_that_messages_name_are_settings(project_root):
     """An advice that names a setting can be typed; only ``unknown KEY=VALUE`` may say the last part alone."""
     known = settings_of_all_commands(project_root)
@@ -290,7 +299,7 @@ def test_settings_that_messages_name_are_settings(project_root):
             name = getattr(node.func, "id", getattr(node.func, "attr", ""))
             if not (name.endswith("Error") or name in ("info", "warning", "error")) or not node.args:
                 continue
-            text = ast.unparse(node.args[0])
+            text = " ".join(texts_in(node.args[0]))
             for before, key in re.findall(r"(unknown )?(?<![\w./}-])([a-z_][\w./]*)=(?!=)", text):
                 found += 1
                 is_known = key in known or (before and key in last_parts) or key == "key"

@@ -352,7 +352,7 @@ class RayTran(nn.Module):
             check_shape(grid_center, "3", "grid_center")
             if values and not bool(grid_center.isfinite().all()):
                 raise DataError(
-                    f"grid_center={grid_center.tolist()} is no place: give three numbers in metres"
+                    f"a grid_center of {grid_center.tolist()} is no place: give three numbers in metres"
                 )
         images = views.images.float() if views.images.is_floating_point() else views.images
         cameras = Cameras.of(views).to(torch.float32)

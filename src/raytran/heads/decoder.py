@@ -38,8 +38,8 @@ class DecoderLayer(nn.Module):
         super().__init__()
         if channels % num_heads:
             raise ConfigError(
-                f"object head needs channels divisible by num_heads, got channels={channels}, "
-                f"num_heads={num_heads}"
+                f"object head needs channels divisible by num_heads, got {channels} channels and {num_heads} "
+                "heads: choose fewer heads"
             )
         self.self_norm = nn.LayerNorm(channels)
         self.self_attention = SelfAttention(channels, num_heads, batch_first=True)

@@ -67,18 +67,22 @@ def run_curriculum(
     ]
     with one_at_a_time(output_dir):
         _record(output_dir, overrides, stages)
-        return _train_stages(overrides, output_dir, stages, presets)
+        return _train_stages(overrides, output_dir, stages, presets, of_stage or {})
 
 
 def _train_stages(
-    overrides: Sequence[str], output_dir: Path, stages: Sequence[str], presets: Sequence[str]
+    overrides: Sequence[str],
+    output_dir: Path,
+    stages: Sequence[str],
+    presets: Sequence[str],
+    of_stage: Mapping[str, Sequence[str]],
 ) -> list[FitResult]:
     """Train the stages that have not finished."""
     results: list[FitResult] = []
     for number, experiment in enumerate(stages, start=1):
         _log.info("stage %d of %d: experiment=%s", number, len(stages), experiment)
         folder = output_dir / experiment
-        own = (of_stage or {}).get(experiment, ())
+        own = of_stage.get(experiment, ())
         settings = [
             *overrides,
             *own,
