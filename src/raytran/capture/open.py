@@ -213,7 +213,7 @@ def _unknown(path: Path) -> DataError:
             f"{path} has images without poses: let COLMAP or a phone's ARKit find them, or write "
             "trajectory.txt and intrinsics.txt beside them (docs/own-data.md)"
         )
-    return DataError(f"{path} holds {listing.summary()[:80]}, and no scene: read are {_READ}")
+    return DataError(f"{path} holds {listing.summary(most=2)}, and no scene: read are {_READ}")
 
 
 def _lacking(path: Path, listing: Listing) -> str | None:

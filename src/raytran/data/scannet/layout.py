@@ -78,12 +78,12 @@ class Listing:
             raise DataError(f"cannot read the folder {path} ({error.strerror}): check the path") from error
         return cls(path, frozenset(folders), frozenset(files))
 
-    def summary(self) -> str:
-        """Return what the folder holds, in a few words."""
+    def summary(self, *, most: int = 6) -> str:
+        """Return what the folder holds, in a few words: ``most`` of its folders, and of its files' endings."""
         endings = Counter(Path(name).suffix or "without ending" for name in self.files)
-        contents = [f"the folder {name}" for name in sorted(self.folders)[:6]]
-        contents += ["more folders"] if len(self.folders) > 6 else []
-        contents += [f"{count} files {ending}" for ending, count in endings.most_common(4)]
+        contents = [f"the folder {name}" for name in sorted(self.folders)[:most]]
+        contents += ["more folders"] if len(self.folders) > most else []
+        contents += [f"{count} files {ending}" for ending, count in endings.most_common(min(most, 4))]
         return ", ".join(contents) or "nothing"
 
 
