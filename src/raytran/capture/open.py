@@ -242,14 +242,17 @@ def _folders_in(folder: Path) -> list[Path]:
 
 
 def _scans_below(path: Path) -> list[Path]:
-    """Return the scenes in the folders of a folder and in theirs; none if one of these cannot be read."""
+    """Return the scenes up to three folders below a folder; none if one of these cannot be read."""
     found: list[Path] = []
+    level, looked_at = [path], 0
     try:
-        for folder in _folders_in(path)[:_MAX_LOOKED_AT]:
-            inner = [] if _fitting(folder) else _folders_in(folder)[:_MAX_LOOKED_AT]
-            found += [folder] if _fitting(folder) else [deeper for deeper in inner if _fitting(deeper)]
-            if len(found) >= _MAX_LOOKED_AT:
-                break
+        for _ in range(3):
+            folders = [folder for parent in level for folder in _folders_in(parent)]
+            folders = folders[: _MAX_LOOKED_AT - looked_at]
+            looked_at += len(folders)
+            fits = [bool(_fitting(folder)) for folder in folders]
+            found += [folder for folder, is_scene in zip(folders, fits, strict=True) if is_scene]
+            level = [folder for folder, is_scene in zip(folders, fits, strict=True) if not is_scene]
     except DataError:
         return []
     return found

@@ -79,7 +79,7 @@ class Listing:
         return cls(path, frozenset(folders), frozenset(files))
 
     def summary(self, *, most: int = 6) -> str:
-        """Return what the folder holds, in a few words: ``most`` of its folders, and of its files' endings."""
+        """Return what the folder holds, in a few words: ``most`` of its folders, and of its files' kinds."""
         endings = Counter(Path(name).suffix or "without ending" for name in self.files)
         contents = [f"the folder {name}" for name in sorted(self.folders)[:most]]
         contents += ["more folders"] if len(self.folders) > most else []
