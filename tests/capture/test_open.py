@@ -152,7 +152,7 @@ def test_what_a_folder_lacks_is_said(tmp_path, files, message):
 
 def test_scenes_below_a_folder_are_named(walk, scannet, tmp_path):
     write_colmap(walk, walk.folder / "sparse" / "0", binary=True)
-    with pytest.raises(DataError, match=r"is no scene but holds some: give one of exported/walk, walk$"):
+    with pytest.raises(DataError, match=r"is no scene but holds some: give one of walk, exported/walk$"):
         open_scene(tmp_path)
     for n in range(4):
         (tmp_path / "exported" / str(n)).symlink_to(scannet)
