@@ -108,6 +108,10 @@ def load_stream(path: Path) -> Any:
         raise ValueError(f"{type(error).__name__}: {error}") from error
 
 
+class CompressedArchiveError(pickle.UnpicklingError):
+    """What PyTorch never writes: small in the file, and as large as it likes in memory."""
+
+
 def _pickle_length(content: bytes) -> int:
     """Return the bytes of the pickle with which ``content`` begins."""
     *_, (_, _, position) = pickletools.genops(content)
@@ -121,7 +125,7 @@ def _check_archive(archive: zipfile.ZipFile, path: Path) -> None:
         raise ValueError("two parts have one name")
     # PyTorch compresses nothing; what is small here and huge in memory is not from it. Nor do parts overlap.
     if any(part.compress_type != zipfile.ZIP_STORED for part in parts):
-        raise pickle.UnpicklingError("it is a compressed archive")
+        raise CompressedArchiveError
     size = path.stat().st_size
     if any(part.file_size != part.compress_size for part in parts) or _total(parts) > size:
         raise ValueError("its parts are larger than the file")

@@ -165,7 +165,7 @@ def test_a_voxel_network_runs_before_the_first_block_and_leaves_the_rest_as_it_w
 
 
 def test_channels_must_split_into_heads() -> None:
-    with pytest.raises(ConfigError, match="num_heads=3"):
+    with pytest.raises(ConfigError, match="3 heads"):
         Backbone(encoder=ResNet18(width=8), channels=16, num_heads=3)
 
 

@@ -18,7 +18,7 @@ def test_a_prediction_goes_through_few_files():
     assert {"model.py", "backbone/block.py", "heads/shape.py"} <= set(found.files)
     assert not any(name.startswith(("training/", "losses/")) for name in found.files)
     assert len(found.files) <= 20
-    assert found.changes <= 90
+    assert found.changes <= 100  # a dozen of them check the views
 
 
 def test_what_is_counted(tmp_path, monkeypatch):

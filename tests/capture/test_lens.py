@@ -231,7 +231,7 @@ def test_a_distortion_nobody_sees_is_not_resampled():
         ),
         (replace(PLAIN, center=(float("nan"), 1.0)), "no positive, finite", "not positive and finite"),
         (replace(PLAIN, center=(1e300, 1.0)), "no positive, finite", "not positive and finite"),
-        (replace(PLAIN, focal=(1e-300, 1.0)), "no positive, finite", "not positive and finite"),
+        (replace(PLAIN, focal=(1e-300, 1.0)), "focal lengths of 1e-300 and 1 pixels", "no lens has"),
         (replace(FISHEYE, distortion=(float("inf"), 0.0, 0.0, 0.0)), "no positive, finite", "not positive"),
         (replace(FISHEYE, distortion=(-3.0, 0.0, 0.0, 0.0)), "folds the image onto itself", "folds"),
         (replace(PLAIN, size=(100_000, 100_000)), "for images of 100000x100000.*shrink", "1 to 8192 pixels"),

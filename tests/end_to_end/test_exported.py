@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 from raytran.checkpoints.file import read_checkpoint
 from raytran.checkpoints.runs import LAST
@@ -52,7 +53,7 @@ def test_weights_are_no_run_to_resume(settings, weights, tmp_path):
 
 def test_evaluate_takes_weights(settings, weights, tmp_path, monkeypatch):
     words = [*settings[:2], f"checkpoint={weights}", f"output={tmp_path / 'results'}"]
-    typed = SimpleNamespace(overrides=SimpleNamespace(task=words))
+    typed = SimpleNamespace(overrides=SimpleNamespace(task=OmegaConf.create(words)))
     monkeypatch.setattr("raytran.run.evaluate.evaluate.HydraConfig", SimpleNamespace(get=lambda: typed))
     assert evaluate(compose("evaluate", words))["checkpoint"] == str(weights)
     assert json.loads((tmp_path / "results" / "metrics.json").read_text())["strict"]["n_scenes"] == 1

@@ -121,5 +121,5 @@ def test_norms_over_the_voxels_remember_as_they_are_told(generator: torch.Genera
 
 @pytest.mark.parametrize("wrong", [{"num_blocks": 0}, {"num_levels": 0}])
 def test_nothing_is_refused(wrong: dict[str, int]) -> None:
-    with pytest.raises(ConfigError, match="a block and a level"):
+    with pytest.raises(ConfigError, match="num_blocks and num_levels of at least 1"):
         UnprojectionBackbone(encoder=ResNet18(width=8), channels=8, **wrong)

@@ -25,7 +25,7 @@ from raytran.data.images import is_turned
 from raytran.data.scan import TURNED
 from raytran.errors import ConfigError, DataError
 from raytran.geometry.camera import FARTHEST_CENTER, center_offset, other_image_size
-from raytran.limits import FOCAL_LENGTH, MAX_SIDE
+from raytran.limits import MAX_SIDE, PIXEL
 
 _SAME_PX = 0.25
 """Largest shift of a pixel for which an image is used without resampling, pixels."""
@@ -238,8 +238,8 @@ def check_lens(lens: Lens, where: str) -> Lens:
 @lru_cache(maxsize=4096)
 def _fault(lens: Lens) -> tuple[str, str] | None:
     """Return why a lens is none: a sentence with a place for its name, and a few words."""
-    numbers = (*lens.focal, *lens.center, *lens.distortion, lens.radial_8)
-    if not (np.abs(numbers) <= FOCAL_LENGTH.high).all() or min(lens.focal) < FOCAL_LENGTH.low:
+    others = (*lens.center, *lens.distortion, lens.radial_8)
+    if not (np.isfinite(lens.focal).all() and min(lens.focal) > 0 and (np.abs(others) <= PIXEL.high).all()):
         return (
             "{where} has no positive, finite focal lengths and centre: calibrate it again",
             "focal lengths and centre not positive and finite",

@@ -32,7 +32,7 @@ from raytran.data.files import UNFINISHED, whole_file
 from raytran.data.text import parse_json
 from raytran.errors import CheckpointError, ConfigError
 from raytran.limits import MAX_STEPS, shown
-from raytran.tensor_archive import load_archive
+from raytran.tensor_archive import CompressedArchiveError, load_archive
 
 _log = logging.getLogger(__name__)
 
@@ -113,6 +113,10 @@ def read_checkpoint(path: Path) -> dict[str, Any]:
 def _read_torch_file(path: Path) -> dict[str, Any]:
     try:
         content = load_archive(path)
+    except CompressedArchiveError as error:
+        raise CheckpointError(
+            f"{path} was not loaded: it is a compressed archive, as PyTorch writes none; do not use this file"
+        ) from error
     except pickle.UnpicklingError as error:
         raise CheckpointError(
             f"{path} was not loaded: it holds more than tensors and plain values, which no checkpoint of "

@@ -15,7 +15,8 @@ from torch import Tensor
 
 from raytran.errors import ConfigError, check_shape
 from raytran.geometry.camera import Cameras
-from raytran.setting_limits import MAX_CELLS, check_settings
+from raytran.limits import BOX_SIDE
+from raytran.setting_limits import MAX_CELLS, MAX_CELLS_A_SIDE, check_settings
 from raytran.structs import constant, kept_on_device, sent_to
 
 
@@ -40,9 +41,8 @@ class VoxelGrid:
     def __post_init__(self) -> None:
         center = torch.as_tensor(self.center)
         object.__setattr__(self, "center", center if center.is_floating_point() else center.float())
-        resolution, extent = checked_grid(self.resolution, self.extent)
-        object.__setattr__(self, "resolution", resolution)
-        object.__setattr__(self, "extent", extent)
+        if not _can_be(self.resolution, self.extent):
+            checked_grid(self.resolution, self.extent)  # It says what is wrong.
         if self.center.shape[-1:] != (3,):
             check_shape(self.center, "... 3", "center")
 
@@ -91,6 +91,16 @@ def _numbers(values: Sequence[float], like: Tensor) -> Tensor:
     if like.is_cpu:
         return torch.stack([like.new_full((), value) for value in values])
     return constant(tuple(values), like.dtype, device=like.device)
+
+
+def _can_be(resolution: Sequence[int], extent: Sequence[float]) -> bool:
+    """Whether a grid is as ``checked_grid`` wants it, told in few steps: grids are made in every pass."""
+    if not len(resolution) == len(extent) == 3:
+        return False
+    x, y, z = resolution
+    is_whole = type(x) is type(y) is type(z) is int
+    cells = is_whole and min(x, y, z) > 0 and max(x, y, z) <= MAX_CELLS_A_SIDE and x * y * z <= MAX_CELLS
+    return cells and BOX_SIDE.low <= min(extent) and max(extent) <= BOX_SIDE.high
 
 
 def checked_grid(

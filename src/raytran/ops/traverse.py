@@ -31,9 +31,10 @@ NUDGE = 1e-9
 _PARALLEL = 1e-12
 """Slopes below this, in voxels per metre of depth, count as zero."""
 
-_NO_RAY = 1e200
+_NO_RAY = 1e30
 """Voxels per metre of depth, along each axis, of a ray that is none: it is through the whole grid within a
-depth far below ``NUDGE``, wherever it begins, so that nothing has to be taken out of lists of rays."""
+depth far below ``NUDGE``, wherever it begins, so that nothing has to be taken out of lists of rays. Its
+inverse is a number in float32 too."""
 
 _VIEWS_AT_ONCE = 8
 """Views that are counted together."""

@@ -295,7 +295,8 @@ def typed_config_dir(hydra_config: Any) -> list[str]:
 def run_or_exit(function: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
     """Return ``function(cfg)``; a mistake of the user's becomes a sentence on stderr and exit code 1."""
     try:
-        check_settings(OmegaConf.to_container(cfg, resolve=False))  # type: ignore[arg-type]
+        if OmegaConf.is_config(cfg):
+            check_settings(OmegaConf.to_container(cfg, resolve=False))  # type: ignore[arg-type]
         return function(cfg)
     except RaytranError as error:
         _exit_with(error)
