@@ -283,6 +283,7 @@ def _quiet() -> None:
         ".*in eval mode at the start of training.*",
         ".*isinstance.treespec, LeafSpec.*",
         ".*smaller than the logging interval.*",
+        ".*overridden `transfer_batch_to_device`.*",  # in the module, which serves any loader
         "Grad strides do not match bucket view strides.*",  # of a convolution to one channel
         ".*recommended to use .*sync_dist=True.*",  # the metrics have gathered over the ranks themselves
     ):
