@@ -78,6 +78,7 @@ def test_ranks_share_the_batch_norms_of_voxels_too(steps, tmp_path, command):
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_ranks_with_batch_norms_of_their_own_train_one_network(curriculum, steps, tmp_path, command):
     """Two passes a step too: then the strategy may not take the graph for a static one."""
     arguments = [*steps, "trainer=ddp_cpu", "experiment=stage1", "views.batch_size=1", "sync_norms=false"]
