@@ -13,7 +13,7 @@ from PIL import Image
 
 from raytran.capture.open import open_scene
 from raytran.capture.orientation import WorldSettings
-from raytran.capture.video import VideoFile, find_video, open_video, read_video
+from raytran.capture.video import VideoFile, _numbers_of_poses, find_video, open_video, read_video
 from raytran.data.images import turned_image
 from raytran.errors import ConfigError, DataError
 
@@ -273,3 +273,10 @@ def test_a_rate_that_was_told_wrong_is_matched_by_number(walk, video, caplog):
     with open_video(read_video(video)) as scan:
         np.testing.assert_allclose(scan.world_from_camera.numpy(), walk.poses, atol=1e-6)
     assert "matched by number" in caplog.text
+
+
+def test_times_of_no_video_are_no_frame_numbers(recwarn):
+    times = np.arange(12) / 10
+    for odd in (1e20, 1e300):
+        assert _numbers_of_poses(np.append(times[:-1], odd), times) is None
+    assert not recwarn.list

@@ -347,6 +347,8 @@ def _numbers_of_poses(
     count = pose_times / interval
     if len(pose_times) == len(times) and abs(count[0]) < 2:
         count = count - count[0]
+    if not np.abs(count).max() < 1e9:  # times of no video, which are no whole numbers either
+        return None
     numbers = count.round().astype(np.int64)
     rates = [abs(interval / step - 1) for step in (np.median(steps), steps.mean())]
     is_grid = np.abs(count - numbers).max() < _EVEN * max(1.0, 0.01 * len(times)) and min(rates) < _SAME_RATE
