@@ -261,9 +261,10 @@ def test_rays_outside_of_pictures_are_left_out_without_a_wait():
 @on_pretend_device
 def test_the_values_of_views_are_waited_for_once():
     views = Inputs(DEVICE).views()
+    center = views.world_from_camera.new_zeros(3)
     for values, expected in ((True, 1), (False, 0)):
         with recorded() as seen:
-            check_views(views, values=values)
+            check_views(views, grid_center=center, values=values)
         assert seen.waits.total() == expected, seen
 
 

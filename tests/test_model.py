@@ -318,8 +318,10 @@ def test_a_prediction_checks_its_views_unless_told_not_to() -> None:
         assert model.predict(spoiled, check=False, with_shapes=False).scene_id == ""
     with pytest.raises(ShapeError, match=r"images of shape \(1, N, 3, H, W\)"):
         model.predict(make_views(scenes=2), check=False)
-    with pytest.raises(DataError, match=r"grid_center of \[0.0, nan, 0.0\] is no place"):
+    with pytest.raises(DataError, match=r"^grid_center is not finite"):
         model.predict(views, grid_center=torch.tensor([0.0, float("nan"), 0.0]))
+    with pytest.raises(DataError, match="grid_center are on meta and images on cpu"):
+        model.predict(views, grid_center=torch.zeros(3, device="meta"))
     with pytest.raises(ShapeError, match="grid_center of shape"):
         model.predict(views, grid_center=torch.zeros(1, 3))
 

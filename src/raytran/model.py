@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from raytran.backbone.backbone import VoxelBackbone
-from raytran.errors import ConfigError, DataError, ShapeError, check_shape
+from raytran.errors import ConfigError, ShapeError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.checks import check_views
 from raytran.geometry.grid import VoxelGrid, checked_grid
@@ -347,13 +347,9 @@ class RayTran(nn.Module):
 
     def _checked(self, views: Views, grid_center: Tensor | None, values: bool) -> Views:
         """Return the views of one scene in float32; raise unless they are such as the commands give."""
-        check_views(views, channels=self.backbone.encoder.input_channels, values=values)
-        if grid_center is not None:
-            check_shape(grid_center, "3", "grid_center")
-            if values and not bool(grid_center.isfinite().all()):
-                raise DataError(
-                    f"a grid_center of {grid_center.tolist()} is no place: give three numbers in metres"
-                )
+        check_views(
+            views, channels=self.backbone.encoder.input_channels, grid_center=grid_center, values=values
+        )
         images = views.images.float() if views.images.is_floating_point() else views.images
         cameras = Cameras.of(views).to(torch.float32)
         return Views(images, cameras.intrinsics, cameras.world_from_camera, cameras.picture)

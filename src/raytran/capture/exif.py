@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from raytran.capture.recording import RecordedScan
-from raytran.data.images import OrientationTags, orientation_tags
+from raytran.data.images import OrientationTags, image_headers, orientation_tags
 from raytran.data.scan import OpenScan
 from raytran.data.scannet.scan import Scan
 
@@ -52,9 +52,10 @@ def with_tags_of_files(scan: OpenScan) -> OpenScan:
         return scan
     count = len(scan)
     some = np.unique(np.linspace(0, count - 1, min(count, _LOOKED_AT)).round().astype(int)).tolist()
-    if not any(orientation_tags([scan.image_path[index] for index in some], applied=True).applied):
+    headers = image_headers([scan.image_path[index] for index in some])
+    if not any(header is not None and header.orientation != 1 for header in headers):
         return scan
-    tags = orientation_tags(scan.image_path, applied=False)
+    tags = orientation_tags(image_headers(scan.image_path), applied=False)
     return replace(scan, tags=tags.reversed([scan.image_size] * count) or tags)
 
 

@@ -170,20 +170,15 @@ class OrientationTags:
         return OrientationTags(self.orientation, applied) if any(is_open) else None
 
 
-def orientation_tags(paths: Sequence[Path], *, applied: bool) -> OrientationTags:
-    """Return the tags of images; one that cannot be read has none.
+def orientation_tags(headers: Sequence[ImageHeader | None], *, applied: bool) -> OrientationTags:
+    """Return the tags of images; one that cannot be read has none: its neighbour takes its place.
 
     Args:
-        paths: their files.
+        headers: what ``image_headers`` returned for them.
         applied: whether those with a tag are turned by it.
     """
-    orientation = []
-    for path in paths:
-        try:
-            orientation.append(_header(path).orientation)
-        except (*UNREADABLE, DataError):  # it is replaced by its neighbour when it is read
-            orientation.append(1)
-    return OrientationTags(tuple(orientation), tuple(applied and tag != 1 for tag in orientation))
+    orientation = tuple(1 if header is None else header.orientation for header in headers)
+    return OrientationTags(orientation, tuple(applied and tag != 1 for tag in orientation))
 
 
 def turned_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:

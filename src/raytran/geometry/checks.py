@@ -31,12 +31,15 @@ def rigid_motions(pose: Tensor) -> Tensor:
     return finite & (error < _SKEWED) & (determinant > 0)
 
 
-def check_views(views: Views, *, channels: int = 3, values: bool = True) -> None:
+def check_views(
+    views: Views, *, channels: int = 3, grid_center: Tensor | None = None, values: bool = True
+) -> None:
     """Raise unless views are such as the commands give a network.
 
     Args:
         views: posed images of one scene, B = 1.
         channels: of the images.
+        grid_center: ``(3,)`` centre of the voxel grid, metres, if it is given.
         values: check what is in the tensors too, for which the host waits for a GPU once; False checks types
             and shapes alone.
 
@@ -45,7 +48,7 @@ def check_views(views: Views, *, channels: int = 3, values: bool = True) -> None
         DataError: a tensor is of the wrong type or on another device than the images; a pose is not finite or
             no rigid motion; intrinsics are not finite, have no positive focal lengths, another last row than
             0, 0, 1, or a principal point farther from the middle than ``FARTHEST_CENTER``; colours are not
-            numbers from 0 to 1; or a picture is empty or leaves its image.
+            numbers from 0 to 1; a picture is empty or leaves its image; or the grid's centre is not finite.
     """
     images = views.images
     check_shape(images, f"1 N {channels} H W", "images")
@@ -64,21 +67,30 @@ def check_views(views: Views, *, channels: int = 3, values: bool = True) -> None
     for name, tensor in cameras.items():
         if not tensor.is_floating_point():
             raise DataError(f"{name} are of type {tensor.dtype}: give them in floating point")
+    if grid_center is not None:
+        check_shape(grid_center, "3", "grid_center")
+        cameras["grid_center"] = grid_center
+    for name, tensor in cameras.items():
         if tensor.device != images.device:
             raise DataError(f"{name} are on {tensor.device} and images on {images.device}: bring both to one")
     if values:
-        _check_values(views)
+        _check_values(views, grid_center)
 
 
-def _check_values(views: Views) -> None:
+def _check_values(views: Views, grid_center: Tensor | None) -> None:
     """Raise unless the values in the tensors of one scene are possible."""
     faults = _faults(views)
-    found = torch.stack(list(faults.values())).cpu()
-    for text, bad in zip(faults, found[:, 0], strict=True):
+    rows = list(faults.values())
+    if grid_center is not None:
+        rows.append((~grid_center.isfinite()).any().expand_as(rows[0]))
+    found = torch.stack(rows).cpu()  # all in one copy: the host waits once
+    for text, bad in zip(faults, found[: len(faults), 0], strict=True):
         if bad.any():
             index = int(bad.int().argmax())
             others = f" (and {int(bad.sum()) - 1} more)" if bad.sum() > 1 else ""
             raise DataError(f"view {index}{others} has {text}")
+    if grid_center is not None and found[-1].any():
+        raise DataError("grid_center is not finite: give three numbers in metres")
 
 
 def _faults(views: Views) -> dict[str, Tensor]:

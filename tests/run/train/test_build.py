@@ -35,6 +35,14 @@ def test_ranks_share_their_batch_norm_and_look_for_no_unused_parameters(tmp_path
     strategy = trainer(tmp_path, "trainer=ddp_cpu").strategy
     assert isinstance(strategy._layer_sync, SyncedBatchNorm)
     assert not strategy._ddp_kwargs.get("find_unused_parameters", False)
+    assert trainer(tmp_path, "trainer=ddp_cpu", "sync_norms=false").strategy._layer_sync is None
+
+
+def test_the_graph_of_a_step_is_static_if_the_step_is_one_pass(tmp_path):
+    """A static graph is learned in the first pass, which exchanges nothing if another follows."""
+    for passes, is_static in ((1, True), (2, False)):
+        built = trainer(tmp_path, "trainer=ddp_cpu", f"trainer.accumulate_grad_batches={passes}")
+        assert built.strategy._ddp_kwargs["static_graph"] is is_static
 
 
 def test_compile_is_off_until_it_is_asked_for():

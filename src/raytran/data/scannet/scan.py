@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import compress
 from pathlib import Path
 
 import numpy as np
@@ -216,7 +217,7 @@ def read_scan(
     for name, size, has_right_shape in zip(names, sizes, fits, strict=True):
         if not has_right_shape:
             dropped[name] = TURNED if is_turned(size, image_size) else OTHER_SHAPE
-    names = [name for name, has_right_shape in zip(names, fits, strict=True) if has_right_shape]
+    names = list(compress(names, fits))
     sizes = [size for size in sizes if has_shape(size, image_size)]
     paths = tuple(images[name] for name in names)
     return Scan(
@@ -224,7 +225,7 @@ def read_scan(
         folder=folder,
         frame_id=tuple(names),
         image_path=paths,
-        tags=orientation_tags(paths, applied=True) if is_shown else None,
+        tags=orientation_tags(list(compress(headers, fits)), applied=True) if is_shown else None,
         world_from_camera=torch.from_numpy(poses[[fault is None for fault in faults]][fits]),
         # In images of one aspect, brought to one size, all have the same.
         intrinsics=of_all.expand(len(names), 3, 3),

@@ -64,7 +64,7 @@ def predict(cfg: DictConfig) -> Path:
     """
     recording, output = Path(cfg.scene).resolve(), Path(cfg.output)
     world = WorldSettings(up=cfg.up, scale=cfg.scale, convention=cfg.convention, check=cfg.check)
-    intrinsics = parse_intrinsics(cfg.get("intrinsics"))
+    intrinsics = parse_intrinsics(cfg.intrinsics)
     check_choice(cfg.frames, cfg.num_views)
     check_pictures(num_overlays=cfg.num_overlays, turntable=cfg.turntable)
     with one_writer(output, marker=MARKER):
