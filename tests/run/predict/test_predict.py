@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,6 +17,7 @@ from torch import nn
 
 from raytran.checkpoints.load import PredictionSettings
 from raytran.errors import CheckpointError, ConfigError, DataError
+from raytran.run.entry import compose
 from raytran.run.output import one_writer
 from raytran.run.predict import predict as module
 from raytran.run.predict import write_scene
@@ -98,33 +100,16 @@ def oracle(monkeypatch) -> Oracle:
     return model
 
 
+@cache
+def settings_of_the_command() -> DictConfig:
+    return compose("predict", ["scene=unset", "output=unset"])
+
+
 def config(folder, output, **changes) -> DictConfig:
-    values = {
-        "checkpoint": "a.ckpt",
-        "scene": str(folder),
-        "output": str(output),
-        "format": "auto",
-        "up": "auto",
-        "scale": None,
-        "convention": "auto",
-        "check": True,
-        "frames": "coverage",
-        "num_views": None,
-        "score_threshold": 0.5,
-        "duplicate_iou": 0.5,
-        "num_overlays": 2,
-        "views": None,
-        "turntable": 2,
-        "cads": None,
-        "viewer": True,
-        "truth": None,
-        "views_at_once": 4,
-        "device": "cpu",
-        "attention": "auto",
-        "trust": [],
-        "matmul_precision": "auto",
-    }
-    return OmegaConf.create(values | changes)
+    """The command's own settings, those that cost time made small, with ``changes``."""
+    paths = {"checkpoint": "a.ckpt", "scene": str(folder), "output": str(output)}
+    small = {"num_overlays": 2, "turntable": 2, "views_at_once": 4, "device": "cpu", "duplicate_iou": 0.5}
+    return OmegaConf.merge(settings_of_the_command(), paths | small | changes)
 
 
 def test_all_files_are_written(scene, oracle, tmp_path):
