@@ -118,12 +118,11 @@ class Reconstruction(pl.LightningModule):
         self._val_losses.clear()
 
     def configure_optimizers(self) -> Any:
-        """Return AdamW over what the stage trains, with its schedule; fused on a GPU.
+        """Return AdamW over what the stage trains, with its schedule.
 
-        But not in 16-mixed, whose scaler does not let fused optimisers clip.
+        Fused, all parameters in one pass, but not in 16-mixed, whose scaler does not let fused optimisers clip.
         """
-        scales = getattr(self.trainer.precision_plugin, "scaler", None) is not None
-        fused = self.device.type not in ("cpu", "mps") and not scales
+        fused = getattr(self.trainer.precision_plugin, "scaler", None) is None
         steps = int(self.trainer.estimated_stepping_batches)
         return self.optimization.build(self.model.parameters(), steps, fused=fused)
 
@@ -148,7 +147,8 @@ class Reconstruction(pl.LightningModule):
         elif gradient_clip_val and self.gradient_norms():
             norm = self.gradient_norms()["all"]
             if optimizer.defaults.get("fused"):
-                vars(optimizer)["grad_scale"] = ((norm + 1e-6) / gradient_clip_val).clamp(min=1.0)
+                scale = ((norm + 1e-6) / gradient_clip_val).clamp(min=1.0)
+                vars(optimizer)["grad_scale"] = scale.float()  # also of parameters in float64
             else:
                 nn.utils.clip_grads_with_norm_(self.model.parameters(), gradient_clip_val, norm)
         self._gradient_norms = None
