@@ -259,7 +259,9 @@ def test_evaluate_writes_numbers(trained, rooms, tmp_path, command):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("stop", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("stop", "code"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.nightly)]
+)
 def test_a_stopped_run_goes_on(stop, code, settings, tmp_path, command):
     long = [*settings, "trainer.max_steps=400", "checkpoint_every=100000", "trainer.val_check_interval=1000"]
     with subprocess.Popen(

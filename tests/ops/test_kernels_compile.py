@@ -63,6 +63,7 @@ def test_paper_sizes_compile_once_for_any_number_of_views_and_spill_nothing(capa
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_the_largest_heads_that_are_not_refused_spill_nothing_that_matters():
     cases = [f"{str(dtype).removeprefix('torch.')}:{channels}" for dtype, channels in MOST_CHANNELS.items()]
     for kernel in compiled(80, (*cases, "bfloat16:64")):

@@ -19,7 +19,7 @@ from raytran.run.plan.plan import GIBIBYTE, Need, advice, parse_size, plan
 from raytran.run.plan.roofline import Ceilings, measure_ceilings
 from raytran.run.train.build import build_model
 
-FAST = ["preset=tiny", "ceilings=[1,10]"]
+FAST = ["preset=tiny", "ceilings=[1,10]", "model.backbone.num_blocks=1", "model.heads.objects.num_layers=1"]
 
 
 def make_scan(folder: Path) -> Path:

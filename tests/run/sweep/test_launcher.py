@@ -184,6 +184,7 @@ def test_a_signal_stops_the_jobs_and_the_same_command_goes_on(sweep):
     assert [len(calls(folder / number)) for number in "01"] == [2, 1]
 
 
+@pytest.mark.nightly
 def test_a_job_that_outlives_its_launcher_keeps_the_sweep(sweep):
     process = sweep.start("seed=1,2", JOB_WAITS_FOR="go")
     wait_for(lambda: started(sweep))
