@@ -65,6 +65,9 @@ aten = torch.ops.aten
 _set_up_backend = getattr(backend_registration, "_setup_privateuseone_for_python_backend", None)
 
 _COPIES = {aten.copy_.default, aten._to_copy.default}
+_CONVOLUTIONS = {aten.convolution.default: 0, aten.convolution_backward.default: 1}
+"""Convolutions, and where the features are among their arguments, followed by the weight."""
+
 _INDEXING = {aten.index.Tensor, aten.index_put.default, aten.index_put_.default}
 _WAITS = {
     aten._linalg_check_errors.default: "a check for errors",
@@ -89,8 +92,10 @@ _NO_LAUNCH = {
     ),
     *("empty", "empty_like", "empty_strided", "new_empty", "new_empty_strided", "resize_"),
 }
-_TENSORS_A_LAUNCH = 30
-"""Tensors that one launch of a ``_foreach`` or fused operation takes; on CUDA between 30 and 110."""
+_TENSORS_A_LAUNCH = (110, 64, 48, 36, 30)
+"""Tensors of each list that one launch of a ``_foreach`` or fused operation takes, by the number of lists
+(``MultiTensorApply.cuh`` in torch). That it takes no more than 320 pieces of 65,536 elements is left out of
+the count: a test's tensors are small. With the weights of the paper's network it makes one launch more."""
 
 _ATTENTION_BACKWARD = 3
 """Kernels in which flash attention computes its gradients; forward it is one."""
@@ -172,7 +177,8 @@ def kernels_left_out() -> Iterator[None]:
             capacity,
         )
         if known not in _traced:
-            trace(cameras, grid, *rest, capacity=capacity)  # makes what is kept for all others
+            with recorded():
+                trace(cameras, grid, *rest, capacity=capacity)  # makes what is kept for all others
             with recorded() as seen:
                 _traced[known] = trace(cameras, grid, *rest, capacity=capacity), seen
         (pairs, number), seen = _traced[known]
@@ -294,13 +300,16 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
             run = _stand_ins[form.name]
             _ledger.launches[form.name] += _KERNELS[form.name]
     elif form.launches:
-        at_once = _TENSORS_A_LAUNCH if form.name.startswith(("_foreach", "_fused")) else None
-        _ledger.launches[form.name] += -(-len(args[0]) // at_once) if at_once else 1
+        _ledger.launches[form.name] += _launches_of(func, form.name, args)
     kwargs_inside = {key: _inside(value) for key, value in kwargs.items()}
     if device is not None:
         kwargs_inside["device"] = torch.device("cpu")
         kwargs_inside.pop("non_blocking", None)
     found = run(*map(_inside, args), **kwargs_inside)
+    if func in _CONVOLUTIONS:
+        found = _laid_out(found, _form_of_convolution(func, args))
+    elif func is aten.native_group_norm.default:
+        found = _laid_out(found, torch.contiguous_format)  # CUDA's gives no other
     if device is not None and not _is_here(device):
         # What comes from the device without a wait, torch puts into page-locked memory.
         return _lock_page(found) if kwargs.get("non_blocking") else found
@@ -309,6 +318,40 @@ def _run(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
         for value, place in zip(found if len(form.changed) > 1 else [found], form.changed, strict=False)
     ]
     return tuple(results) if len(results) > 1 else results[0] if results else None
+
+
+def _launches_of(func: Any, name: str, args: Any) -> int:
+    """Return how many kernels an operation launches, as far as that is known here."""
+    if name.startswith(("_foreach", "_fused")):
+        return _launches_over_lists(name, args)
+    if func in _CONVOLUTIONS:
+        form = _form_of_convolution(func, args)
+        tensors = [argument.inner for argument in args[: _CONVOLUTIONS[func] + 2]]
+        return 1 + sum(not tensor.is_contiguous(memory_format=form) for tensor in tensors)  # it copies them
+    if func is aten.native_group_norm.default:
+        return 1 if args[0].inner.is_contiguous() else 2
+    return 1
+
+
+def _form_of_convolution(func: Any, args: Any) -> torch.memory_format:
+    """Return how cuDNN wants what a convolution reads, and gives it: channels last, if any of it lies so."""
+    features, weight = (argument.inner for argument in args[_CONVOLUTIONS[func] :][:2])
+    last = {4: torch.channels_last, 5: torch.channels_last_3d}[weight.ndim]
+    lies_so = features.is_contiguous(memory_format=last) or weight.is_contiguous(memory_format=last)
+    return last if lies_so else torch.contiguous_format
+
+
+def _launches_over_lists(name: str, args: Any) -> int:
+    """Return how many kernels an operation over lists of tensors launches."""
+    lists = [argument for argument in args if isinstance(argument, list | tuple)]
+    lists = [values for values in lists if values and isinstance(values[0], Tensor)]
+    layouts = [[(tensor.shape, tensor.stride()) for tensor in tensors] for tensors in lists]
+    if name == "_foreach_copy_" and layouts[0] != layouts[1]:
+        return len(lists[0])  # then one after another
+    # A fused optimiser reads the steps, its last list, beside the pieces of the others.
+    depth = len(lists) - name.startswith("_fused")
+    launches = -(-len(lists[0]) // _TENSORS_A_LAUNCH[depth - 1])
+    return launches + 2 if name == "_foreach_norm" else launches  # zeros before, the pieces' sum behind
 
 
 def _wait(reason: str) -> None:
@@ -381,6 +424,12 @@ def _tensors(values: Any) -> Iterator[Tensor]:
     elif isinstance(values, list | tuple | dict):
         for value in values.values() if isinstance(values, dict) else values:
             yield from _tensors(value)
+
+
+def _laid_out(value: Any, form: torch.memory_format) -> Any:
+    if isinstance(value, tuple):
+        return tuple(_laid_out(item, form) for item in value)
+    return value.contiguous(memory_format=form) if isinstance(value, Tensor) and value.ndim > 1 else value
 
 
 def _inside(value: Any) -> Any:

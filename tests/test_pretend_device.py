@@ -145,15 +145,40 @@ def test_launches_are_counted_and_views_are_not():
         x.T.contiguous().add_(1).view(16)
         torch.zeros(2, device=DEVICE)
     assert seen.launches == {"clone": 1, "add_": 1, "zeros": 1}
-    many = [torch.ones(2, device=DEVICE) for _ in range(31)]
+    many, across = ([torch.ones(2, 3, device=DEVICE) for _ in range(111)] for _ in range(2))
     with recorded() as seen:
         torch._foreach_mul_(many, 2.0)
-    assert seen.launches == {"_foreach_mul_": 2}
+        torch._foreach_copy_(many, across)
+        torch._foreach_norm(many)
+    assert seen.launches == {"_foreach_mul_": 2, "_foreach_copy_": 2, "_foreach_norm": 4}
+    across[5] = across[5].view(3, 2).T
+    with recorded() as seen:
+        torch._foreach_copy_(many, across)
+    assert seen.launches == {"_foreach_copy_": 111}  # one that lies otherwise, and all are copied one by one
     query = torch.rand(1, 2, 3, 4, device=DEVICE, requires_grad=True)
     with recorded() as seen:
         nn.functional.scaled_dot_product_attention(query, query, query).backward(query.detach())
     assert seen.launches["attention"] == 1
     assert seen.launches["attention_backward"] == 3
+
+
+@on_pretend_device
+def test_convolutions_and_norms_copy_what_lies_otherwise():
+    last, weight = torch.channels_last, torch.ones(4, 4, 3, 3, device=DEVICE)
+    x = torch.rand(2, 4, 5, 6, device=DEVICE)
+
+    def launches(x, weight):
+        with recorded() as seen:
+            out = nn.functional.conv2d(x, weight)
+        return seen.launches["convolution"], out.inner.is_contiguous(memory_format=last)
+
+    assert launches(x, weight) == (1, False)
+    assert launches(x.contiguous(memory_format=last), weight) == (2, True)
+    assert launches(x, weight.contiguous(memory_format=last)) == (2, True)
+    assert launches(x.contiguous(memory_format=last), weight.contiguous(memory_format=last)) == (1, True)
+    with recorded() as seen:
+        assert nn.functional.group_norm(x.contiguous(memory_format=last), 2).inner.is_contiguous()
+    assert seen.launches["native_group_norm"] == 2
 
 
 @on_pretend_device
@@ -203,7 +228,7 @@ def test_training_gives_what_it_gives_on_the_cpu():
 def test_optimizers_take_many_tensors_at_once_as_on_cuda():
     with recorded() as seen:
         _trained(DEVICE)
-    assert seen.launches["_foreach_norm"] == 3
+    assert seen.launches["_foreach_norm"] == 3 * 3
     assert seen.launches["_foreach_addcdiv_"] == 3
 
 
