@@ -105,9 +105,11 @@ def test_items_cover_every_row_once_and_long_rows_in_pieces(shaped_pairs, monkey
 
 def test_pieces_are_as_short_as_the_slots_allow(monkeypatch):
     monkeypatch.setattr(block_pairs, "_SLOTS", 6)
-    assert block_pairs._pieces(torch.tensor([64, 3, 0]))[0] == 64
-    assert block_pairs._pieces(torch.tensor([65, 384]))[0] == 128  # 64 would need 2 + 6 slots, 128 needs 3
-    assert block_pairs._pieces(torch.tensor([10**7] * 7))[0] == 2**30
+    # Each of both orders by itself: for the second row 64 would need 2 + 6 slots, 128 needs 3.
+    length, pieces = block_pairs._pieces(torch.tensor([[64, 3, 0], [65, 384, 0]]))
+    assert length.tolist() == [[64], [128]]
+    assert pieces.tolist() == [[1, 1, 1], [1, 3, 1]]
+    assert block_pairs._pieces(torch.tensor([[10**7] * 7] * 2))[0].tolist() == [[2**30]] * 2
 
 
 def test_no_pair_at_all():

@@ -49,13 +49,6 @@ class BlockOrder(NamedTuple):
     num_items: int
     num_merges: int
 
-    @classmethod
-    def of(cls, part_start: Tensor, place: Tensor, items: Tensor, merges: Tensor) -> BlockOrder:
-        """Return the order of these; see the properties."""
-        parts = torch.stack([part_start, place], dim=1)
-        flat = [part.flatten().int() for part in (items, merges, parts)]
-        return cls(torch.cat(flat), items.shape[0], merges.shape[0])
-
     @property
     def items(self) -> Tensor:
         """``(I, 4)`` int32, longest first.
@@ -158,19 +151,11 @@ class BlockPairs(TensorStruct):
 
     def by(self, rows: Literal["pixels", "voxels"]) -> BlockOrder:
         """Return the pairs in rows, one per pixel tile or one per voxel block; made once and kept."""
-        if rows == "pixels":
-            return cached(self, "_by_pixels", self._order_by_pixels)
-        return cached(self, "_by_voxels", self._order_by_voxels)
+        return self.orders()[0 if rows == "pixels" else 1]
 
     def orders(self) -> tuple[BlockOrder, BlockOrder]:
-        """Return both orders, that of pixel tiles first."""
-        return self.by("pixels"), self.by("voxels")
-
-    def _order_by_pixels(self) -> BlockOrder:
-        return self._order(0, self._tile, self._block, self.pixels, self.voxels)
-
-    def _order_by_voxels(self) -> BlockOrder:
-        return self._order(1, self._block, self._tile, self.voxels, self.pixels)
+        """Return both orders, that of pixel tiles first; made once and kept."""
+        return cached(self, "_orders", self._make_orders)
 
     @property
     def _tile(self) -> Tensor:
@@ -180,65 +165,92 @@ class BlockPairs(TensorStruct):
     def _block(self) -> Tensor:
         return self.key % max(self.voxels.num_tiles, 1)
 
-    def _order(self, side: int, row: Tensor, other: Tensor, rows: Tiling, others: Tiling) -> BlockOrder:
-        """Return the order by ``row`` (K,), whose masks are the first or second of each block pair."""
+    def _make_orders(self) -> tuple[BlockOrder, BlockOrder]:
+        """Return the order of the tiles and that of the blocks.
+
+        Both are made at once, in tensors of a row for each: launches cost more than what they compute. The
+        side that has fewer tiles or blocks gets empty ones behind them.
+        """
+        num_rows = max(self.pixels.num_tiles, self.voxels.num_tiles)
+        starts, offsets = _both_sides(self.pixels, self.voxels, num_rows, device=self.key.device)
+        row = torch.stack([self._tile, self._block])
+        part_start = starts.gather(1, row)[..., None] + offsets[:, None, ::PART]
         # The parts that a row does not touch, those of unused pairs among them, are sorted to the end. The
         # sort is stable, so that the order of every sum is fixed.
-        device = row.device
-        untouched = (self.masks[:, side].view(-1, PARTS, PART) == 0).all(dim=2)
-        row = row[:, None].expand(-1, PARTS).masked_fill(untouched, rows.num_tiles)
-        row, found = torch.sort(row.flatten(), stable=True)  # found: PARTS · pair + part
-        offsets = torch.searchsorted(row, _count_to(rows.num_tiles + 1, device=device), out_int32=True)
-        part_start = others.starts(device)[other][:, None] + others.offsets(device)[::PART]
-        place = torch.add(found, found // PARTS, alpha=PARTS) + side * PARTS
-        return BlockOrder.of(
-            part_start.flatten()[found], place.int(), *_schedule(offsets, rows.starts(device))
-        )
+        untouched = (self.masks.view(-1, 2, PARTS, PART) == 0).all(dim=3).transpose(0, 1)
+        row = row[..., None].expand(-1, -1, PARTS).masked_fill(untouched, num_rows)
+        row[1].add_(num_rows + 1)  # blocks come behind tiles
+        row, found = torch.sort(row.flatten(), stable=True)  # found: PARTS · (K · side + pair) + part
+        first = torch.searchsorted(row, _count_to(2 * num_rows + 2, device=row.device), out_int32=True)
+        first = first.view(2, -1)
+        first[1].sub_(PARTS * len(self))
+        place = torch.add(found, found // PARTS, alpha=PARTS).view(2, -1)
+        place[1].sub_(PARTS * (2 * len(self) - 1))  # the second half of a pair's masks
+        # Along a tile lie the parts of blocks, and the other way round.
+        parts = torch.stack([part_start.flip(0).flatten()[found], place.int().flatten()], dim=1)
+        items, merges = _schedule(first, starts)
+        numbers = torch.cat([part.reshape(2, -1) for part in (items, merges, parts)], dim=1)
+        of_tiles, of_blocks = (BlockOrder(some, items.shape[1], merges.shape[1]) for some in numbers)
+        return of_tiles, of_blocks
 
 
 def _schedule(offsets: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
-    """Return ``BlockOrder.items`` and ``.merges``.
+    """Return ``BlockOrder.items`` and ``.merges`` of both orders, ``(2, I, 4)`` and ``(2, R, 3)``.
 
     Args:
-        offsets: ``(rows + 1,)`` int32, where rows begin.
-        start: ``(rows + 1,)`` int32, the first element of each, -1 behind the last.
+        offsets: ``(2, rows + 1)`` int32, where rows begin.
+        start: ``(2, rows + 1)`` int32, the first element of each, -1 behind the last.
     """
     piece, pieces = _pieces(offsets.diff())
     is_cut = pieces > 1
-    counts = torch.stack([pieces, pieces * is_cut, is_cut]).cumsum(dim=1, dtype=torch.int32)
+    counts = torch.stack([pieces, pieces * is_cut, is_cut]).cumsum(dim=2, dtype=torch.int32)
     items_before, slots_before, cuts_before = torch.nn.functional.pad(counts, (1, 0))
     # What is known of each row, and of one more behind them, which unused items and merges are of.
-    ends = torch.stack([start, slots_before, slots_before.roll(-1), items_before, offsets, offsets.roll(-1)])
+    next_slots, next_offsets = slots_before.roll(-1, dims=1), offsets.roll(-1, dims=1)
+    ends = torch.stack([start, slots_before, next_slots, items_before, offsets, next_offsets])
 
-    item = _count_to(start.shape[0] - 1 + _SLOTS, device=start.device)
-    item = torch.minimum(item, items_before[-1])
-    row = torch.searchsorted(items_before[1:], item, right=True)
-    first_element, slot, last_slot, first_item, first, end = ends.index_select(1, row)
+    item = _count_to(start.shape[1] - 1 + _SLOTS, device=start.device)
+    item = torch.minimum(item, items_before[:, -1:])
+    row = torch.searchsorted(counts[0], item, right=True)
+    first_element, slot, last_slot, first_item, first, end = ends.gather(2, row.expand(6, -1, -1))
     number = item - first_item
     first = torch.addcmul(first, number, piece)
     last = torch.minimum(first + piece, end)
     slot = (slot + number).masked_fill(slot == last_slot, -1)
-    items = torch.stack([first_element, first, last, slot], dim=1)
+    items = torch.stack([first_element, first, last, slot], dim=2)
     # What is behind the last row ends before it begins: unused items come last.
-    longest_first = torch.argsort(last - first, descending=True, stable=True)
+    longest_first = torch.argsort(last - first, dim=1, descending=True, stable=True)
 
-    row = torch.searchsorted(cuts_before[1:], _count_to(_SLOTS // 2, device=start.device), right=True)
-    return items[longest_first], ends[:3].index_select(1, row).T.contiguous()
+    cut = _count_to(_SLOTS // 2, device=start.device)
+    row = torch.searchsorted(counts[2], torch.minimum(cut, cuts_before[:, -1:]), right=True)
+    merges = ends[:3].gather(2, row.expand(3, -1, -1)).permute(1, 2, 0)
+    return items.gather(1, longest_first[..., None].expand(-1, -1, 4)), merges
 
 
 def _pieces(lengths: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the length of a piece, ``(1,)``, and how many pieces each row has, for rows of some lengths."""
+    """Return the length of a piece, ``(2, 1)``, and how many each row has, for lengths ``(2, rows)``."""
     choices = constant(tuple(_PIECES), torch.int32, device=lengths.device)
-    pieces = (lengths + (choices - 1)[:, None]) // choices[:, None]
-    slots = pieces.masked_fill(pieces <= 1, 0).sum(dim=1)
+    pieces = (lengths + (choices - 1)[:, None, None]) // choices[:, None, None]
+    slots = pieces.masked_fill(pieces <= 1, 0).sum(dim=2)
     # The slots become fewer from choice to choice.
-    choice = (slots > _SLOTS).sum(dim=0, keepdim=True)
-    return choices.index_select(0, choice), pieces.index_select(0, choice)[0].clamp(min=1)
+    choice = (slots > _SLOTS).sum(dim=0)
+    chosen = pieces.gather(0, choice[:, None].expand_as(lengths)[None])[0]
+    return choices.index_select(0, choice)[:, None], chosen.clamp(min=1)
 
 
 @kept_on_device(16)
 def _count_to(number: int, *, device: torch.device) -> Tensor:
     return torch.arange(number, dtype=torch.int32, device=device)
+
+
+@kept_on_device(16)
+def _both_sides(
+    pixels: Tiling, voxels: Tiling, num_rows: int, *, device: torch.device
+) -> tuple[Tensor, Tensor]:
+    """Return ``Tiling.starts`` of both, filled up to ``(2, num_rows + 1)``, and ``.offsets``, ``(2, 32)``."""
+    starts = [tiling.starts(device) for tiling in (pixels, voxels)]
+    filled = [torch.nn.functional.pad(some, (0, num_rows + 1 - len(some)), value=-1) for some in starts]
+    return torch.stack(filled), torch.stack([tiling.offsets(device) for tiling in (pixels, voxels)])
 
 
 @kept_on_device(16)
