@@ -8,7 +8,7 @@ import torch
 
 from raytran.errors import ConfigError
 from raytran.losses.matcher import HungarianMatcher
-from raytran.losses.objects import Match, TrueObjects
+from raytran.losses.objects import Differences, Match, TrueObjects
 from raytran.structs import PADDING, ObjectSet, RawObjects
 
 WEIGHTS = {"class": 1.0, "center": 2.0, "size": 1.0, "yaw": 1.0}
@@ -22,7 +22,8 @@ def match_one(matcher: HungarianMatcher, raw: RawObjects, objects: ObjectSet) ->
 
 def cost_of(matcher: HungarianMatcher, raw: RawObjects, objects: ObjectSet) -> torch.Tensor:
     """Return the cost ``(Q, M)`` in one scene."""
-    return matcher.cost(raw, TrueObjects.of(objects))[0]
+    true = TrueObjects.of(objects)
+    return matcher.cost(raw, true, Differences.of_all(raw, true))[0]
 
 
 @pytest.mark.parametrize("blind", [(), ("class",), ("center",), ("size", "yaw")])

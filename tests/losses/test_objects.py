@@ -8,7 +8,15 @@ import torch
 
 from raytran.errors import ConfigError
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.losses.objects import Betas, Match, TrueObjects, object_losses, pose_errors, yaw_from_vector
+from raytran.losses.objects import (
+    Betas,
+    Differences,
+    Match,
+    TrueObjects,
+    object_losses,
+    pose_errors,
+    yaw_from_vector,
+)
 from raytran.structs import ObjectSet, RawObjects
 
 
@@ -26,13 +34,13 @@ def one_object(*, yaw: float = 0.0, symmetry: int = 1) -> ObjectSet:
 def errors(
     target: ObjectSet, *, shift: float = 0.0, ratio: float = 1.0, yaw: float = 0.0, betas: Betas | None = None
 ) -> dict[str, float]:
-    found = pose_errors(
+    differences = Differences.of(
         target.center + torch.tensor([shift, 0.0, 0.0]),
         (target.size * torch.tensor([ratio, 1.0, 1.0])).log(),
         3.0 * torch.tensor([[math.sin(yaw), math.cos(yaw)]]),
         TrueObjects.of(target),
-        Betas() if betas is None else betas,
     )
+    found = pose_errors(differences, Betas() if betas is None else betas)
     return {name: float(value) for name, value in found.items()}
 
 
@@ -110,13 +118,15 @@ def test_padding_is_weighted(make_objects, make_perfect, no_object_weight: float
     """Uniform logits cost log 10 whatever the weights; a wrong padding slot counts by its weight."""
     objects, slots = make_objects(1), torch.tensor([0])
     raw = make_perfect(objects, slots, 3)
-    match = Match(slots[None], torch.tensor([[0]]))
+    match, true = Match(slots[None], torch.tensor([[0]])), TrueObjects.of(objects)
 
     def class_loss() -> float:
+        layers = RawObjects.stack([raw])
         found = object_losses(
-            RawObjects.stack([raw]),
-            TrueObjects.of(objects),
+            layers,
+            true,
             match,
+            Differences.of_all(layers, true),
             num_objects=torch.tensor(1.0),
             class_weight=torch.tensor(1 + 2 * no_object_weight),
             no_object_weight=no_object_weight,

@@ -18,7 +18,7 @@ from raytran.errors import ConfigError
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.rotation import yaw_from_rotation
 from raytran.heads.objects import QUERY_SCALE, ObjectHead, ObjectOutputs, Queries
-from raytran.losses.objects import Betas, Match, TrueObjects, object_losses
+from raytran.losses.objects import Betas, Differences, Match, TrueObjects, object_losses
 from raytran.losses.total import ExtensionLoss
 from raytran.structs import CLASSES, ObjectSet, RawObjects, RawScene, sent_to
 
@@ -211,10 +211,12 @@ def denoising_losses(
         *sent_to(stacked.center.device, torch.cat(pairs, dim=1))[:, None].expand(-1, len(layers), -1)
     )
     num_queries = stacked.center.new_full((), scenes * count)
+    true = TrueObjects.of(*targets)
     found = object_losses(
         stacked,
-        TrueObjects.of(*targets),
+        true,
         match,
+        Differences.of_all(stacked, true),
         num_objects=num_queries,
         class_weight=num_queries,
         no_object_weight=0.0,

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from raytran.geometry.grid import VoxelGrid
 from raytran.heads.objects import TYPICAL_SIZE, Queries
-from raytran.losses.objects import Betas, TrueObjects, pose_errors
+from raytran.losses.objects import Betas, Differences, TrueObjects, pose_errors
 from raytran.losses.total import ExtensionLoss
 from raytran.structs import CLASSES, ObjectSet, RawProposals, RawScene
 
@@ -145,8 +145,8 @@ def proposal_losses(
         which, voxel = (heat > LEAST_HEAT).nonzero(as_tuple=True)
         weight = heat[which, voxel] / torch.where(heat > LEAST_HEAT, heat, 0.0).sum(dim=1)[which]
         true = TrueObjects.of(objects).select(which)
-        errors = pose_errors(center[voxel], log_size[voxel], yaw_vector[voxel], true, betas)
-        for name, error in errors.items():
+        differences = Differences.of(center[voxel], log_size[voxel], yaw_vector[voxel], true)
+        for name, error in pose_errors(differences, betas).items():
             totals[name] = totals[name] + (weight * error).sum() / num_objects
     return totals
 

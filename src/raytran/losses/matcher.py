@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor, nn
 
 from raytran.errors import ConfigError
-from raytran.losses.objects import Betas, Match, TrueObjects, pose_errors
+from raytran.losses.objects import Betas, Differences, Match, TrueObjects, pose_errors
 from raytran.structs import RawObjects, sent_to
 
 UNUSABLE = 1e6
@@ -54,7 +54,13 @@ class HungarianMatcher(nn.Module):
         self.weights = {name: float(weights[name]) for name in ("class", "center", "size", "yaw")}
 
     @torch.no_grad()
-    def forward(self, layers: RawObjects, targets: TrueObjects, counts: Sequence[int]) -> Match:
+    def forward(
+        self,
+        layers: RawObjects,
+        targets: TrueObjects,
+        counts: Sequence[int],
+        differences: Differences | None = None,
+    ) -> Match:
         """Match the queries of every layer with the objects of their scene; P is the sum of min(Q, M).
 
         The costs come to the host in one copy, for which it waits, and the pairs go back in one.
@@ -63,8 +69,11 @@ class HungarianMatcher(nn.Module):
             layers: predictions ``(L, B, Q, ...)``.
             targets: true objects of the B scenes.
             counts: how many of them each scene has.
+            differences: ``Differences.of_all`` of these, if they are there already.
         """
-        cost = self.cost(layers, targets).cpu().numpy()
+        if differences is None:
+            differences = Differences.of_all(layers, targets)
+        cost = self.cost(layers, targets, differences).cpu().numpy()
         num_layers, num_scenes, num_queries, _ = cost.shape
         pairs, first = [np.empty((2, num_layers, 0), dtype=np.int64)], 0
         for scene in range(num_scenes):
@@ -75,16 +84,10 @@ class HungarianMatcher(nn.Module):
             first = last
         return Match(*sent_to(layers.center.device, torch.from_numpy(np.concatenate(pairs, axis=2))))
 
-    def cost(self, layers: RawObjects, targets: TrueObjects) -> Tensor:
+    def cost(self, layers: RawObjects, targets: TrueObjects, differences: Differences) -> Tensor:
         """Return the cost ``(..., M)`` of every query ``(...)`` with every true object of all scenes."""
-        errors = pose_errors(
-            layers.center[..., None, :],
-            layers.log_size[..., None, :],
-            layers.yaw_vector[..., None, :],
-            targets,
-            self.betas,
-        )
-        terms = {"class": self._class_cost(layers.class_logits.float())[..., targets.label], **errors}
+        likely = self._class_cost(layers.class_logits.float())[..., targets.label]
+        terms = {"class": likely, **pose_errors(differences, self.betas)}
         cost = torch.stack([self.weights[name] * term for name, term in terms.items()]).sum(dim=0)
         return torch.nan_to_num(cost, nan=UNUSABLE, posinf=UNUSABLE, neginf=UNUSABLE)
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from raytran.errors import ConfigError
 from raytran.geometry.rotation import symmetric_yaw_error, yaw_from_rotation
-from raytran.structs import PADDING, ObjectSet, RawObjects
+from raytran.structs import PADDING, ObjectSet, RawObjects, constant
 
 
 class Match(NamedTuple):
@@ -81,29 +81,67 @@ class Betas(NamedTuple):
         return Betas(float(self.center), float(self.yaw))
 
 
-def pose_errors(
-    center: Tensor, log_size: Tensor, yaw_vector: Tensor, target: TrueObjects, betas: Betas
-) -> dict[str, Tensor]:
-    """Return the pose losses of predictions against true objects, not reduced over objects.
+class Differences(NamedTuple):
+    """By how much the poses of predictions differ from those of true objects.
+
+    Attributes:
+        center: ``(..., 3)`` metres.
+        log_size: ``(..., 3)``.
+        yaw: ``(...)`` radians, wrapped and the least over the symmetries of the true object.
+    """
+
+    center: Tensor
+    log_size: Tensor
+    yaw: Tensor
+
+    @classmethod
+    def of(cls, center: Tensor, log_size: Tensor, yaw_vector: Tensor, target: TrueObjects) -> Differences:
+        """Compare predictions with true objects.
+
+        Args:
+            center: ``(..., M or 1, 3)`` metres.
+            log_size: ``(..., M or 1, 3)``.
+            yaw_vector: ``(..., M or 1, 2)`` (sin, cos), of any length.
+            target: the true objects, ``(M,)`` or one for each prediction.
+        """
+        yaw = symmetric_yaw_error(yaw_from_vector(yaw_vector), target.yaw, target.symmetry)
+        return cls(center - target.center, log_size - target.log_size, yaw)
+
+    @classmethod
+    def of_all(cls, layers: RawObjects, targets: TrueObjects) -> Differences:
+        """Compare every query with every true object of all scenes, ``(L, B, Q, M, ...)``."""
+        center, log_size, yaw_vector = (
+            values[..., None, :] for values in (layers.center, layers.log_size, layers.yaw_vector)
+        )
+        return cls.of(center, log_size, yaw_vector, targets)
+
+    def of_pairs(self, match: Match) -> Differences:
+        """Return those of ``of_all`` that are of matched pairs, ``(L, P, ...)``."""
+        pair = match.query * self.yaw.shape[-1] + match.target
+        center, log_size, yaw = (
+            pick_queries(values.flatten(2, 3), pair)
+            for values in (self.center, self.log_size, self.yaw[..., None])
+        )
+        return Differences(center, log_size, yaw[..., 0])
+
+
+def pose_errors(differences: Differences, betas: Betas) -> dict[str, Tensor]:
+    """Return the pose losses of ``differences``, not reduced over objects.
 
     Smooth L1 of the centre and L1 of the logarithm of the size, each summed over the three axes, and smooth
-    L1 of the yaw, wrapped and taken as the least over the target's symmetries.
+    L1 of the yaw.
 
     Args:
-        center: ``(..., M or 1, 3)`` metres.
-        log_size: ``(..., M or 1, 3)``.
-        yaw_vector: ``(..., M or 1, 2)`` (sin, cos), of any length.
-        target: the true objects, ``(M,)`` or one for each prediction.
+        differences: of any number of pairs ``(...)``.
         betas: of smooth L1.
 
     Returns:
-        ``center``, ``size`` and ``yaw``, each ``(..., M)``.
+        ``center``, ``size`` and ``yaw``, each ``(...)``.
     """
-    yaw_error = symmetric_yaw_error(yaw_from_vector(yaw_vector), target.yaw, target.symmetry)
     return {
-        "center": _smooth_l1(center - target.center, betas.center).sum(dim=-1),
-        "size": (log_size - target.log_size).abs().sum(dim=-1),
-        "yaw": _smooth_l1(yaw_error, betas.yaw),
+        "center": _smooth_l1(differences.center, betas.center).sum(dim=-1),
+        "size": differences.log_size.abs().sum(dim=-1),
+        "yaw": _smooth_l1(differences.yaw, betas.yaw),
     }
 
 
@@ -129,6 +167,7 @@ def object_losses(
     layers: RawObjects,
     targets: TrueObjects,
     match: Match,
+    differences: Differences,
     *,
     num_objects: Tensor,
     class_weight: Tensor,
@@ -141,6 +180,7 @@ def object_losses(
         layers: predictions ``(L, B, Q, ...)``.
         targets: true objects of the B scenes.
         match: pairs of queries and true objects.
+        differences: ``Differences.of_all`` of both.
         num_objects: scalar by which the pose losses' sums are divided.
         class_weight: scalar by which the cross entropies' weighted sum over queries is divided; the sum of
             the weights gives their mean.
@@ -151,15 +191,12 @@ def object_losses(
         ``class``, ``center``, ``size`` and ``yaw`` of each layer, ``(L,)``; zero pose losses without objects.
     """
     logits = layers.class_logits.float().flatten(1, 2)
-    true = targets.select(match.target)
-    label = torch.full(logits.shape[:2], PADDING, device=logits.device).scatter_(1, match.query, true.label)
-    entropy = -logits.log_softmax(dim=-1).gather(2, label[..., None])[..., 0]
-    entropy = entropy * torch.ones_like(entropy).masked_fill(label == PADDING, no_object_weight)
-    center, log_size, yaw_vector = (
-        pick_queries(values, match.query) for values in (layers.center, layers.log_size, layers.yaw_vector)
-    )
-    errors = pose_errors(center, log_size, yaw_vector, true, betas)
-    losses = {"class": entropy.sum(dim=-1) / class_weight}
+    label = torch.full(logits.shape[:2], PADDING, device=logits.device)
+    label.scatter_(1, match.query, targets.label[match.target])
+    weights = constant((*[1.0] * PADDING, no_object_weight), logits.dtype, device=logits.device)
+    entropy = F.cross_entropy(logits.flatten(0, 1), label.flatten(), weights, reduction="none")
+    losses = {"class": entropy.view(label.shape).sum(dim=-1) / class_weight}
+    errors = pose_errors(differences.of_pairs(match), betas)
     return losses | {name: error.sum(dim=-1) / num_objects for name, error in errors.items()}
 
 

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from raytran.errors import ConfigError, DataError
 from raytran.losses.matcher import HungarianMatcher
-from raytran.losses.objects import Betas, Match, TrueObjects, object_losses, pick_queries
+from raytran.losses.objects import Betas, Differences, Match, TrueObjects, object_losses, pick_queries
 from raytran.structs import ObjectSet, RawObjects, RawScene, SceneBatch, Views, constant
 
 
@@ -187,7 +187,8 @@ class TotalLoss(nn.Module):
         layers = RawObjects.stack(predicted if every_layer else predicted[-1:]).in_float32()
         targets, counts = TrueObjects.of(*scenes), [len(objects) for objects in scenes]
         num_objects, class_weight = self._divisors(layers, counts, mean_over_ranks)
-        match = self.matcher(layers, targets, counts)
+        differences = Differences.of_all(layers, targets)
+        match = self.matcher(layers, targets, counts, differences)
         losses: dict[str, Tensor] = {}
         if "shape" in terms:
             if decode_shapes is None:
@@ -207,6 +208,7 @@ class TotalLoss(nn.Module):
             layers,
             targets,
             match,
+            differences,
             num_objects=num_objects,
             class_weight=class_weight,
             no_object_weight=self.no_object_weight,
