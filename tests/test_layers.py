@@ -13,7 +13,7 @@ LAYERS: list[set[str]] = [
     {"limits", "tensor_archive"},
     {"setting_limits"},
     {"geometry"},
-    {"ops"},
+    {"ops", "norms"},
     {"backbone", "heads"},
     {"model"},
     {"losses", "metrics", "data", "postprocess"},

@@ -6,7 +6,7 @@ import torch
 
 from raytran.extensions.windowed_attention import WindowedAttention
 from raytran.geometry.grid import VoxelGrid
-from raytran.heads.decoder import DecoderLayer, VoxelAttention
+from raytran.heads.decoder import DecoderLayer, VoxelAttention, keys_and_values_together
 
 
 def voxel_centers() -> torch.Tensor:
@@ -37,3 +37,22 @@ def test_every_parameter_gets_a_gradient(attention: type) -> None:
     )
     out.square().sum().backward()
     assert [name for name, p in layer.named_parameters() if p.grad is None or not p.grad.any()] == []
+
+
+def test_keys_and_values_made_together_equal_those_of_each_attention() -> None:
+    torch.manual_seed(0)
+    attentions = torch.nn.ModuleList(VoxelAttention(channels=8, num_heads=2) for _ in range(3))
+    queries, places = torch.randn(2, 4, 8), (torch.zeros(2, 4, 3), torch.zeros(5, 3))
+    found = []
+    for together in (True, False):
+        attentions.zero_grad()
+        memory = torch.randn(2, 5, 8, generator=torch.Generator().manual_seed(1)).requires_grad_()
+        memories = keys_and_values_together(list(attentions), memory) if together else [memory] * 3
+        read = [
+            attention(queries, places[0], of_layer, places[1])
+            for attention, of_layer in zip(attentions, memories, strict=True)
+        ]
+        torch.stack(read).square().sum().backward()
+        found.append([*read, memory.grad, *(p.grad.clone() for p in attentions.parameters())])
+    for mine, expected in zip(*found, strict=True):
+        torch.testing.assert_close(mine, expected, atol=1e-5, rtol=1e-4)

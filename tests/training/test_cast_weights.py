@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import nn
 
-from raytran.backbone.block import LayerNorm
 from raytran.heads.decoder import in_product_dtype
+from raytran.norms import LayerNorm
 from raytran.training.cast_weights import weights_cast_together
 
 from ..factories import make_model, make_views

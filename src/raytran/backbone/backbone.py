@@ -10,10 +10,11 @@ import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
-from raytran.backbone.block import LayerNorm, RayTracedBlock
+from raytran.backbone.block import RayTracedBlock
 from raytran.errors import ConfigError, ShapeError, check_shape
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid, ray_code, voxel_code
+from raytran.norms import LayerNorm
 from raytran.ops.pairs import Pairs
 from raytran.ops.splat import splat_in_chunks
 

@@ -43,7 +43,9 @@ class WindowedAttention(VoxelAttention):
             bias = self.window.bias.view(num_heads, 4).zero_()
             bias[:, 3] = torch.lerp(log_width[0], log_width[1], torch.linspace(0, 1, num_heads))
 
-    def forward(self, queries: Tensor, reference: Tensor, memory: Tensor, voxel_position: Tensor) -> Tensor:
+    def forward(  # type: ignore[override]
+        self, queries: Tensor, reference: Tensor, memory: Tensor, voxel_position: Tensor
+    ) -> Tensor:
         """Return ``(B, Q, C)``; the arguments are those of ``DecoderLayer.forward``."""
         query, key, value = self.query(queries), self.key(memory), self.value(memory)
         # Squares of metres need more digits than 16-bit floats have.

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from torch import Tensor, nn
 
 from raytran.errors import ConfigError
+from raytran.norms import GroupNorm
 
 GROUPS = 4
 """Groups of the normalisation between two layers of an upsampler."""
@@ -78,7 +79,7 @@ def image_upsampler(channels: int, widths: Sequence[int], outputs: int) -> nn.Se
     for inputs, width in zip((channels, *widths[:-1]), widths, strict=True):
         layers += [
             nn.ConvTranspose2d(inputs, width, 4, stride=2, padding=1),
-            nn.GroupNorm(GROUPS, width),
+            GroupNorm(GROUPS, width),
             nn.ReLU(inplace=True),
         ]
     layers.append(nn.ConvTranspose2d(widths[-1], outputs, 4, stride=2, padding=1))

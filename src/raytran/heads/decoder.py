@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import cast
 
 import torch
@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from raytran.errors import ConfigError
+from raytran.norms import LayerNorm
 
 
 class DecoderLayer(nn.Module):
@@ -41,13 +42,13 @@ class DecoderLayer(nn.Module):
                 f"object head needs channels divisible by num_heads, got {channels} channels and {num_heads} "
                 "heads: choose fewer heads"
             )
-        self.self_norm = nn.LayerNorm(channels)
+        self.self_norm = LayerNorm(channels)
         self.self_attention = SelfAttention(channels, num_heads, batch_first=True)
-        self.voxel_norm = nn.LayerNorm(channels)
+        self.voxel_norm = LayerNorm(channels)
         make_attention = VoxelAttention if voxel_attention is None else voxel_attention
         self.voxel_attention = make_attention(channels=channels, num_heads=num_heads)
         self.feed_forward = nn.Sequential(
-            nn.LayerNorm(channels), nn.Linear(channels, hidden), nn.GELU(), nn.Linear(hidden, channels)
+            LayerNorm(channels), nn.Linear(channels, hidden), nn.GELU(), nn.Linear(hidden, channels)
         )
 
     def forward(
@@ -55,32 +56,36 @@ class DecoderLayer(nn.Module):
         queries: Tensor,
         position: Tensor,
         reference: Tensor,
-        memory: Tensor,
+        memory: Tensor | KeysAndValues,
         voxel_position: Tensor,
         mask: Tensor | None = None,
     ) -> Tensor:
         """Return the queries after the layer.
 
         Args:
-            queries: ``(B, Q, C)``.
+            queries: ``(B, Q, C)``, under autocast in its 16 bits, see ``in_product_dtype``.
             position: ``(B, Q, C)`` code of the reference points.
             reference: ``(B, Q, 3)`` reference points, metres from the centre of the volume.
-            memory: ``(B, V, C)`` voxel features with the code of their positions.
+            memory: ``(B, V, C)`` voxel features with the code of their positions, or for ``VoxelAttention``
+                what ``keys_and_values_together`` made of them.
             voxel_position: ``(V, 3)`` voxel centres, metres from the centre of the volume.
             mask: ``(Q, Q)`` bool, True where the query of a row must not attend to that of a column.
 
         Returns:
             ``(B, Q, C)``.
         """
-        x = in_product_dtype(self.self_norm(queries))
+        x = self.self_norm(queries)
         queries = queries + self.self_attention(x + position, x, mask)
-        located = in_product_dtype(self.voxel_norm(queries)) + position
+        located = self.voxel_norm(queries) + position
         queries = queries + self.voxel_attention(located, reference, memory, voxel_position)
         return queries + self.feed_forward(queries)
 
 
 def in_product_dtype(x: Tensor) -> Tensor:
-    """Return ``x`` as autocast's products take it: cast once for all that read it."""
+    """Return ``x`` as autocast's products take it.
+
+    The decoder's stream is cast where it begins: every product takes it as it is, and casts nothing back.
+    """
     kind = x.device.type
     return x.to(torch.get_autocast_dtype(kind)) if torch.is_autocast_enabled(kind) else x
 
@@ -111,6 +116,10 @@ class SelfAttention(nn.MultiheadAttention):
         return self.out_proj(attended.transpose(1, 2).flatten(2))
 
 
+KeysAndValues = tuple[Tensor, Tensor]
+"""Keys and values of the voxels, each ``(B, V, C)``."""
+
+
 class VoxelAttention(nn.Module):
     """Multi-head attention to all voxels.
 
@@ -127,13 +136,29 @@ class VoxelAttention(nn.Module):
         self.value = nn.Linear(channels, channels)
         self.output = nn.Linear(channels, channels)
 
-    def forward(self, queries: Tensor, reference: Tensor, memory: Tensor, voxel_position: Tensor) -> Tensor:
+    def forward(
+        self, queries: Tensor, reference: Tensor, memory: Tensor | KeysAndValues, voxel_position: Tensor
+    ) -> Tensor:
         """Return ``(B, Q, C)``; the arguments are those of ``DecoderLayer.forward``."""
+        made = (self.key(memory), self.value(memory)) if isinstance(memory, Tensor) else memory
         query = self._heads(self.query(queries))
-        key = self._heads(self.key(memory))
-        value = self._heads(self.value(memory))
+        key, value = map(self._heads, made)
         return self.output(F.scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(2))
 
     def _heads(self, x: Tensor) -> Tensor:
         """Map ``(B, n, C)`` to ``(B, heads, n, D)``."""
         return x.unflatten(-1, (self.num_heads, -1)).transpose(1, 2)
+
+
+def keys_and_values_together(
+    attentions: Sequence[VoxelAttention], memory: Tensor
+) -> tuple[KeysAndValues, ...]:
+    """Return the keys and values that each attention makes of ``memory`` ``(B, V, C)``, in two products.
+
+    All are in memory at once, as in training they are in any case.
+    """
+    key, value = (torch.cat([getattr(one, name).weight for one in attentions]) for name in ("key", "value"))
+    bias = torch.cat([one.value.bias for one in attentions])
+    made = F.linear(memory, key), F.linear(memory, value, bias)
+    keys, values = (of_all.unflatten(-1, (len(attentions), -1)).unbind(-2) for of_all in made)
+    return tuple(zip(keys, values, strict=True))

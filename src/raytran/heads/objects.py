@@ -15,7 +15,14 @@ from torch.quasirandom import SobolEngine
 from raytran.errors import ConfigError
 from raytran.geometry.grid import VoxelGrid, centered_voxels, position_code, voxel_code
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.heads.decoder import DecoderLayer, in_product_dtype
+from raytran.heads.decoder import (
+    DecoderLayer,
+    KeysAndValues,
+    VoxelAttention,
+    in_product_dtype,
+    keys_and_values_together,
+)
+from raytran.norms import LayerNorm
 from raytran.structs import CLASSES, PADDING, ObjectSet, RawObjects, RawProposals
 
 QUERY_SCALE = 0.1
@@ -184,11 +191,12 @@ class ObjectHead(nn.Module):
         channels = self.position.in_features
         code = voxel_code(*shape, self.grid_extent, channels, like.dtype, device=like.device)
         memory = voxels.flatten(1, 3) + self.position(code.flatten(0, 2))
-        embedding = queries.embedding
+        embedding = in_product_dtype(queries.embedding)
+        memories = self._memory_of_layers(memory)
         # On a GPU what the next layer does not start from is predicted for all layers together.
         together = type(self.refinement) is CenterRefinement and not voxels.is_cpu
         outputs, places = [], []
-        for layer, predictor in zip(self.layers, self.predictors, strict=True):
+        for layer, predictor, memory in zip(self.layers, self.predictors, memories, strict=True):
             position = self._encode_positions(queries.reference)
             embedding = layer(embedding, position, queries.reference, memory, voxel_position, mask)
             if together:
@@ -201,6 +209,15 @@ class ObjectHead(nn.Module):
         if together:
             return predict_together(list(self.predictors), places, queries, grid_center)
         return tuple(outputs)
+
+    def _memory_of_layers(self, memory: Tensor) -> Sequence[Tensor | KeysAndValues]:
+        """Return what each layer reads of ``memory`` ``(B, V, C)``: itself, or keys and values made of it."""
+        attentions: list[Any] = [layer.voxel_attention for layer in self.layers]
+        is_plain = all(type(attention) is VoxelAttention for attention in attentions)
+        # In training on a GPU for all layers together; a prediction keeps those of one layer in memory.
+        if is_plain and torch.is_grad_enabled() and not memory.is_cpu:
+            return keys_and_values_together(attentions, memory)
+        return [memory] * len(attentions)
 
     def _encode_positions(self, points: Tensor) -> Tensor:
         """Return the code ``(..., C)`` of points ``(..., 3)``, metres from the centre of the volume."""
@@ -226,12 +243,10 @@ class _Place(NamedTuple):
 
     Attributes:
         embedding: ``(B, Q, C)`` normalised.
-        read: the same, as products read it.
         reference: ``(B, Q, 3)`` box centres, metres from the centre of the volume.
     """
 
     embedding: Tensor
-    read: Tensor
     reference: Tensor
 
 
@@ -244,7 +259,7 @@ class ObjectPredictor(nn.Module):
 
     def __init__(self, *, channels: int) -> None:
         super().__init__()
-        self.norm = nn.LayerNorm(channels)
+        self.norm = LayerNorm(channels)
         self.category = nn.Linear(channels, len(CLASSES) + 1)
         self.offset = _perceptron(channels, 3)
         self.log_size = _perceptron(channels, 3)
@@ -253,20 +268,20 @@ class ObjectPredictor(nn.Module):
     def place(self, embedding: Tensor, reference: Tensor) -> _Place:
         """Return where the objects of query embeddings ``(B, Q, C)`` stand, near the reference points."""
         embedding = self.norm(embedding)
-        read = in_product_dtype(embedding)
-        return _Place(embedding, read, reference + self.offset(read).float())
+        return _Place(embedding, reference + self.offset(embedding))
 
     def forward(self, embedding: Tensor, start: Queries, grid_center: Tensor) -> RawObjects:
         """Return the predictions for query embeddings ``(B, Q, C)``, added to the boxes of ``start``.
 
-        Pose is float32 even under autocast: 16 bits resolve a centre at 4 m to no better than millimetres.
+        Pose is float32 even under autocast, because ``start`` is: 16 bits resolve a centre at 4 m to no
+        better than millimetres.
         """
         embedding = self.norm(embedding)
         return RawObjects(
             class_logits=self.category(embedding).float(),
-            center=start.reference + self.offset(embedding).float() + grid_center[:, None],
-            log_size=start.log_size + self.log_size(embedding).float(),
-            yaw_vector=start.yaw_vector + self.yaw(embedding).float(),
+            center=start.reference + self.offset(embedding) + grid_center[:, None],
+            log_size=start.log_size + self.log_size(embedding),
+            yaw_vector=start.yaw_vector + self.yaw(embedding),
             embedding=embedding,
         )
 
@@ -282,18 +297,18 @@ def predict_together(
         start: sizes and yaws that all layers start from.
         grid_center: ``(B, 3)`` metres.
     """
-    read = torch.stack([place.read for place in places]).flatten(1, 2)
+    embeddings = torch.stack([place.embedding for place in places])
+    read = embeddings.flatten(1, 2)
 
     def predicted(name: str) -> Tensor:
         perceptrons = [getattr(one, name) for one in predictors]
         hidden = F.gelu(_apply_each([one[0] for one in perceptrons], read))
-        return _apply_each([one[2] for one in perceptrons], hidden).float().unflatten(1, scenes)
+        return _apply_each([one[2] for one in perceptrons], hidden).unflatten(1, scenes)
 
     scenes = start.reference.shape[:2]
     logits = _apply_each([one.category for one in predictors], read).float().unflatten(1, scenes)
     center = torch.stack([place.reference for place in places]) + grid_center[:, None]
     log_size, yaw_vector = start.log_size + predicted("log_size"), start.yaw_vector + predicted("yaw")
-    embeddings = [place.embedding for place in places]
     return tuple(map(RawObjects, logits, center, log_size, yaw_vector, embeddings))
 
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from torch import Tensor, nn
 
 from raytran.heads.auxiliary import check_widths
+from raytran.norms import GroupNorm
 
 
 class ShapeHead(nn.Module):
@@ -46,4 +47,4 @@ class ShapeHead(nn.Module):
 
 def _normalize(width: int) -> nn.Sequential:
     # Normalisation per object: the result does not depend on what else is in the batch.
-    return nn.Sequential(nn.GroupNorm(ShapeHead.GROUPS, width), nn.ReLU(inplace=True))
+    return nn.Sequential(GroupNorm(ShapeHead.GROUPS, width), nn.ReLU(inplace=True))

@@ -15,12 +15,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn.modules.conv import _ConvNd
 
-from raytran.backbone.block import LayerNorm
+from raytran.norms import GroupNorm, LayerNorm
 
-_CAST = (nn.Linear, _ConvNd, nn.MultiheadAttention, LayerNorm)
+_CAST = (nn.Linear, _ConvNd, nn.MultiheadAttention, LayerNorm, GroupNorm)
 """Modules that autocast runs in 16 bits, and norms that follow their input."""
 
-_OURS = ("raytran.model", "raytran.backbone.", "raytran.heads.")
+_OURS = ("raytran.model", "raytran.backbone.", "raytran.heads.", "raytran.norms")
 """Where modules leave it to autocast in which precision their parts compute; others may not."""
 
 
