@@ -20,10 +20,12 @@ from raytran.structs import RawScene, SceneBatch
 from raytran.training.cast_weights import weights_cast_together
 from raytran.training.health_signals import gradient_norms
 from raytran.training.loggers import is_logged_step
+from raytran.training.norm_counters import batches_counted_together
 from raytran.training.optim import Optimization
 from raytran.training.ranks import mean_over_ranks
 from raytran.training.scores import SceneScores
 from raytran.training.stage import Stage
+from raytran.training.weight_layout import lay_channels_last
 
 
 class Reconstruction(pl.LightningModule):
@@ -59,6 +61,11 @@ class Reconstruction(pl.LightningModule):
         self._val_losses: dict[str, MeanMetric] = {}
         self._gradient_norms: dict[str, Tensor] | None = None
 
+    def configure_model(self) -> None:
+        """Lay out weights for a GPU, before ranks and optimiser look at them."""
+        if self.trainer.strategy.root_device.type not in ("cpu", "mps"):
+            lay_channels_last(self.model)
+
     def transfer_batch_to_device(
         self, batch: SceneBatch, device: torch.device, dataloader_idx: int
     ) -> SceneBatch:
@@ -82,7 +89,8 @@ class Reconstruction(pl.LightningModule):
         with self._weights_for_a_step():
             # A step waits for its device once: where queries are matched, and else for the number of pairs.
             traced = self._trace(batch, wait=not {"objects", "shape"} & set(self.stage.terms))
-            raw = self._run_model(batch, traced._replace(fits=None))
+            with batches_counted_together(self.model):
+                raw = self._run_model(batch, traced._replace(fits=None))
             losses = self._losses(raw, batch, mean_over_ranks=over_ranks)
         if traced.fits is not None:
             # A step that lacks pairs is skipped, like one that is not finite.

@@ -14,6 +14,7 @@ from torch.optim import AdamW, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 
 from raytran.setting_limits import check_settings
+from raytran.training.weight_layout import lay_moments_as_weights
 
 
 def learning_rate_factor(step: int, *, total_steps: int, warmup_steps: int, decay: str) -> float:
@@ -71,6 +72,7 @@ class Optimization:
         trained = [parameter for parameter in parameters if parameter.requires_grad]
         optimizer = AdamW(trained, lr=self.learning_rate, weight_decay=self.weight_decay, fused=fused)
         optimizer.register_load_state_dict_pre_hook(_stay_as_fused)
+        optimizer.register_load_state_dict_post_hook(lay_moments_as_weights)
         factor = partial(
             learning_rate_factor, total_steps=total_steps, warmup_steps=self.warmup_steps, decay=self.decay
         )
