@@ -128,7 +128,7 @@ class Reconstruction(pl.LightningModule):
     def configure_optimizers(self) -> Any:
         """Return AdamW over what the stage trains, with its schedule.
 
-        Fused, all parameters in one pass, but not in 16-mixed, whose scaler does not let fused optimisers clip.
+        Fused, all parameters in one pass, but not in 16-mixed: its scaler lets no fused optimiser clip.
         """
         fused = getattr(self.trainer.precision_plugin, "scaler", None) is None
         steps = int(self.trainer.estimated_stepping_batches)
