@@ -9,8 +9,11 @@ from pathlib import Path
 import pytest
 
 LAYERS: list[set[str]] = [
-    {"structs", "errors"},
-    {"limits", "tensor_archive"},
+    {"errors"},
+    {"limits"},
+    {"classes"},
+    {"structs"},
+    {"tensor_archive"},
     {"setting_limits"},
     {"geometry"},
     {"ops", "norms"},

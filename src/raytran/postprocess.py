@@ -4,8 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -145,7 +144,7 @@ def merge_volumes(predictions: Sequence[ScenePrediction], volumes: Volumes) -> S
     volume = torch.cat(
         [torch.full((len(part),), index, device=part.label.device) for index, part in enumerate(parts)]
     )
-    objects = _join(parts)
+    objects = ObjectSet.join(parts)
     volumes = replace(volumes, center=volumes.center.to(objects.center.device))
     owned = volumes.owner(objects.center) == volume
     to_middle = volumes.center[volume] - objects.center
@@ -170,16 +169,6 @@ def merge_volumes(predictions: Sequence[ScenePrediction], volumes: Volumes) -> S
         occupancy=_join_voxels([prediction.occupancy for prediction in predictions], volumes),
         seen=_join_voxels([prediction.seen for prediction in predictions], volumes),
     )
-
-
-def _join(parts: Sequence[ObjectSet]) -> ObjectSet:
-    """Return the objects of several sets, without models, in one."""
-    some = [part for part in parts if len(part)] or list(parts[:1])
-    columns: dict[str, Any] = {"model_id": ()}
-    for name in {field.name for field in fields(ObjectSet)} - columns.keys():
-        values = [getattr(part, name) for part in some]
-        columns[name] = None if any(value is None for value in values) else torch.cat(values)
-    return ObjectSet(**columns)
 
 
 def _join_voxels(values: Sequence[Tensor | None], volumes: Volumes) -> Tensor | None:

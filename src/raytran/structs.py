@@ -8,7 +8,7 @@ Shape letters, used in every docstring of the project:
 ``N``  views (video frames) of a scene                 ``C``     channels of a feature
 ``H W`` rows and columns of an image                   ``P``     pixel-voxel pairs
 ``h w`` rows and columns of a feature map (stride 16)  ``Q``     object queries
-``M``  objects                                         ``K``     classes without padding (9)
+``M``  objects                                         ``K``     classes without padding
 ``S``  cells along one side of a shape grid (63)       ``L``     decoder layers
 ====== =============================================== ====== ==================================
 
@@ -24,6 +24,9 @@ from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor
+
+from raytran.classes import PAPER_CLASSES, Classes
+from raytran.errors import DataError
 
 CLASSES: tuple[str, ...] = (
     *("bathtub", "bookshelf", "cabinet", "chair", "display", "sofa", "table", "trashbin", "other"),
@@ -100,7 +103,7 @@ class TensorStruct:
         def pick(value: Any) -> Any:
             if isinstance(value, tuple):
                 return tuple(value[i] for i in chosen) if value else ()
-            return None if value is None else value[index]
+            return value if value is None or isinstance(value, Classes) else value[index]
 
         return replace(self, **{field.name: pick(getattr(self, field.name)) for field in fields(self)})
 
@@ -233,7 +236,7 @@ class ObjectSet(TensorStruct):
     """The ``M`` objects of one scene, true or predicted, in the world of the scene's poses.
 
     Attributes:
-        label: ``(M,)`` int64, index into ``CLASSES``.
+        label: ``(M,)`` int64, index into ``classes.names``.
         center: ``(M, 3)`` centre of the object's box, metres.
         size: ``(M, 3)`` full extents along the object's own axes (x width, y height, z depth), metres.
         rotation: ``(M, 3, 3)`` world_from_object; if upright ``Rz(yaw) · B`` (``geometry.rotation``).
@@ -245,6 +248,7 @@ class ObjectSet(TensorStruct):
             in [0, 1] for predictions.
         model_id: ``catid/id`` of each object's CAD model, or empty.
         num_views: ``(M,)`` how many views saw each object's box, the mean over the box; None if not counted.
+        classes: what the labels stand for.
     """
 
     label: Tensor
@@ -256,20 +260,53 @@ class ObjectSet(TensorStruct):
     shape: Tensor | None = None
     model_id: tuple[str, ...] = ()
     num_views: Tensor | None = None
+    classes: Classes = PAPER_CLASSES
 
     def __len__(self) -> int:
         return int(self.label.shape[0])
+
+    @property
+    def category(self) -> tuple[str, ...]:
+        """Name of each object's class; on a GPU the host waits for the labels."""
+        return self.classes.names_of(self.label.tolist())
 
     def select(self, index: Tensor) -> ObjectSet:
         """Return the objects at ``index``, an int64 ``(M',)`` or bool ``(M,)`` tensor, in that order."""
         return self._select(len(self), index)
 
     @staticmethod
-    def empty() -> ObjectSet:
+    def empty(classes: Classes = PAPER_CLASSES) -> ObjectSet:
         """Return a set of no objects."""
         none = torch.zeros(0, dtype=torch.int64)
         vectors = torch.zeros(0, 3)
-        return ObjectSet(none, vectors, vectors, torch.zeros(0, 3, 3), none, torch.zeros(0))
+        return ObjectSet(none, vectors, vectors, torch.zeros(0, 3, 3), none, torch.zeros(0), classes=classes)
+
+    @staticmethod
+    def join(sets: Sequence[ObjectSet]) -> ObjectSet:
+        """Return the objects of several sets, at least one, in one, one set after another.
+
+        Shapes, CAD models and numbers of views are kept if all sets that have objects have them.
+
+        Raises:
+            DataError: the sets do not have the same classes.
+        """
+        for objects in sets:
+            if objects.classes.names != sets[0].classes.names:
+                raise DataError(
+                    f"objects of the classes {objects.classes} cannot stand in one set with objects of "
+                    f"{sets[0].classes}: read them with the same classes"
+                )
+        some = [objects for objects in sets if len(objects)] or list(sets[:1])
+
+        def joined(name: str) -> Any:
+            values = [getattr(objects, name) for objects in some]
+            if name == "classes":
+                return values[0]
+            if name == "model_id":
+                return tuple(one for value in values for one in value) if all(values) else ()
+            return None if any(value is None for value in values) else torch.cat(values)
+
+        return ObjectSet(**{field.name: joined(field.name) for field in fields(ObjectSet)})
 
 
 @dataclass(frozen=True)

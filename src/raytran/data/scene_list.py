@@ -6,6 +6,7 @@ from __future__ import annotations
 import pickle
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
+from itertools import accumulate
 from pathlib import Path
 
 import torch
@@ -79,14 +80,8 @@ class ObjectTable:
     """
 
     def __init__(self, scenes: Sequence[ObjectSet]) -> None:
-        # The empty set in front gives the tensors their types if there is no scene, and the first end, 0.
-        sets = [ObjectSet.empty(), *scenes]
-        names = ("label", "center", "size", "rotation", "symmetry", "score")
-        self._all = ObjectSet(
-            **{name: torch.cat([getattr(objects, name) for objects in sets]) for name in names},
-            model_id=tuple(model_id for objects in sets for model_id in objects.model_id),
-        )
-        self._ends = tuple(torch.tensor([len(objects) for objects in sets]).cumsum(0).tolist())
+        self._all = ObjectSet.join(list(scenes) or [ObjectSet.empty()])
+        self._ends = (0, *accumulate(map(len, scenes)))
 
     def __len__(self) -> int:
         return len(self._ends) - 1

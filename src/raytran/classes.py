@@ -1,0 +1,252 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The classes of objects that a network tells apart: their names, colours and categories of ShapeNet."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from raytran.errors import ConfigError
+from raytran.limits import shown
+
+Color = tuple[int, int, int]
+"""Red, green, blue in [0, 255]."""
+
+MAX_CLASSES = 500
+
+OTHER = "other"
+"""A class of this name takes the objects of all categories that belong to no class."""
+
+PADDING_NAME = "padding"
+"""What a network says of a query that holds no object: always its last output, and no class."""
+
+_MAX_NAME = 60
+"""Characters."""
+
+_NOT_IN_NAMES = ("/", "\\")
+"""Names are parts of paths: of scores in logs, and of nodes in files of meshes and in the viewer."""
+
+_PAPER: dict[str, tuple[str, Color]] = {
+    "bathtub": ("02808440", (23, 190, 207)),
+    "bookshelf": ("02871439", (140, 86, 75)),
+    "cabinet": ("02933112", (255, 127, 14)),
+    "chair": ("03001627", (31, 119, 180)),
+    "display": ("03211117", (148, 103, 189)),
+    "sofa": ("04256520", (214, 39, 40)),
+    "table": ("04379243", (44, 160, 44)),
+    "trashbin": ("02747177", (227, 119, 194)),
+    OTHER: ("", (127, 127, 127)),
+}
+"""ShapeNet's category (Scan2CAD EvaluateBenchmark.py) and the colour of each class of the paper."""
+
+_LEVELS = range(20, 256, 47)
+_DARKEST, _LIGHTEST = 60.0, 190.0
+"""Of the palette, as grey: it is seen on white pages, and under white text."""
+
+
+@dataclass(frozen=True)
+class Classes:
+    """The ``K`` classes that labels 0 to K - 1 stand for; a network adds padding behind them (RayTran §3.2).
+
+    Attributes:
+        names: one for each label.
+        colors: red, green and blue in [0, 255] of each class, in pictures and meshes alike. Left out: the
+            paper's for the names of its classes, and for other names colours that differ from these.
+        catids: categories that belong to each class, as annotations name them: eight digits of ShapeNet, or
+            any other name. A category that none lists belongs to the class of its name, or else to ``other``.
+            Left out: Scan2CAD's for the names of the paper's classes, none for other names.
+
+    Raises:
+        ConfigError: there is no class, or there are too many; names are not distinct printable texts; a
+            colour is none; or two classes list the same category.
+    """
+
+    names: tuple[str, ...]
+    colors: tuple[Color, ...] = ()
+    catids: tuple[tuple[str, ...], ...] = ()
+
+    def __post_init__(self) -> None:
+        _check_names(self.names)
+        colors = self.colors or _filled_colors(self.names, {})
+        catids = self.catids or _filled_catids(self.names, {})
+        if not len(colors) == len(catids) == len(self.names):
+            raise ConfigError(f"{len(self.names)} classes need as many colours and lists of categories")
+        # Tuples of plain values, whatever was given: what is hashed and compared.
+        object.__setattr__(self, "names", tuple(self.names))
+        object.__setattr__(self, "colors", tuple(map(_checked_color, self.names, colors)))
+        object.__setattr__(self, "catids", tuple(map(_checked_catids, self.names, catids)))
+        listed = [catid for some in self.catids for catid in some]
+        if len(set(listed)) < len(listed):
+            twice = next(catid for catid in listed if listed.count(catid) > 1)
+            raise ConfigError(f"the category {shown(twice)} is listed twice: give it to one class")
+
+    @classmethod
+    def of(cls, settings: Any) -> Classes:
+        """Return the classes that a config, or the description in a checkpoint, names.
+
+        Args:
+            settings: ``names``, a list; and, or null, ``colors`` and ``catids`` by name: for those left out
+                see the attributes. A category, or a list of them. None: the paper's nine.
+
+        Raises:
+            ConfigError: it is something else, or see ``Classes``.
+        """
+        if settings is None:
+            return PAPER_CLASSES
+        if isinstance(settings, Classes):
+            return settings
+        if not isinstance(settings, Mapping) or not set(settings) <= {"names", "colors", "catids"}:
+            raise ConfigError("classes are given by names, colors and catids: see conf/classes/paper.yaml")
+        names = settings.get("names")
+        if not isinstance(names, list | tuple):
+            raise ConfigError(f"classes.names={shown(names)} is no list: write it as classes.names=[a,b]")
+        _check_names(names)
+        colors = _by_name("colors", settings.get("colors"), names)
+        catids = _by_name("catids", settings.get("catids"), names)
+        return cls(tuple(names), _filled_colors(names, colors), _filled_catids(names, catids))
+
+    def settings(self) -> dict[str, Any]:
+        """Return what ``of`` makes these classes of again: lists and texts."""
+        return {
+            "names": list(self.names),
+            "colors": {name: list(color) for name, color in zip(self.names, self.colors, strict=True)},
+            "catids": {name: list(some) for name, some in zip(self.names, self.catids, strict=True)},
+        }
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def index(self, name: str) -> int:
+        """Return the label of a class.
+
+        Raises:
+            ConfigError: there is no class of that name.
+        """
+        if name not in self.names:
+            raise ConfigError(f"{shown(name)} is no class: choose one of {self}")
+        return self.names.index(name)
+
+    def label_of(self, category: str) -> int | None:
+        """Return the label of objects that an annotation puts into ``category``.
+
+        That is the class that lists it in ``catids``, or the one of that name, or ``other``. None: they
+        belong to no class.
+        """
+        labels = _label_by_category(self)
+        return labels.get(category, labels.get(OTHER))
+
+    def names_of(self, labels: Iterable[int]) -> tuple[str, ...]:
+        """Return the name of each label."""
+        return tuple(self.names[label] for label in labels)
+
+    def hex(self, label: int) -> str:
+        """Return a class's colour as ``#rrggbb``."""
+        return "#{:02x}{:02x}{:02x}".format(*self.colors[label])
+
+    def __str__(self) -> str:
+        return ", ".join(self.names)
+
+
+def _check_names(names: Sequence[Any]) -> None:
+    if not 0 < len(names) <= MAX_CLASSES:
+        raise ConfigError(
+            f"expected 1 to {MAX_CLASSES} classes, got {len(names)}: name them in classes.names"
+        )
+    for name in names:
+        if not isinstance(name, str):
+            raise ConfigError(f'the class {shown(name)} is no text: put it in quotes, as in "{shown(name)}"')
+        if not name or name != name.strip() or not name.isprintable() or len(name) > _MAX_NAME:
+            raise ConfigError(
+                f"{shown(name)} is no name of a class: give 1 to {_MAX_NAME} printable characters"
+            )
+        if name == PADDING_NAME or any(character in name for character in _NOT_IN_NAMES):
+            raise ConfigError(
+                f"{shown(name)} cannot be the name of a class: take one without slashes, not {PADDING_NAME}"
+            )
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if list(names).count(name) > 1)
+        raise ConfigError(f"the class {shown(twice)} is named twice: name each once in classes.names")
+
+
+def _by_name(what: str, given: Any, names: Sequence[str]) -> Mapping[str, Any]:
+    """Return what is given for some of the names."""
+    if given is None:
+        return {}
+    if not isinstance(given, Mapping):
+        raise ConfigError(f"classes.{what} is given by the name of the class: write it as {{{names[0]}: …}}")
+    unknown = [name for name in given if name not in names]
+    if unknown:
+        raise ConfigError(
+            f"classes.{what} has {shown(unknown[0])}, which is no class: choose of classes.names"
+        )
+    return given
+
+
+def _filled_colors(names: Sequence[str], given: Mapping[str, Any]) -> tuple[Color, ...]:
+    known = {name: color for name, (_, color) in _PAPER.items()} | {
+        name: _checked_color(name, color) for name, color in given.items() if color is not None
+    }
+    of_palette = iter(_palette(sum(name not in known for name in names)))
+    return tuple(known[name] if name in known else next(of_palette) for name in names)
+
+
+def _filled_catids(names: Sequence[str], given: Mapping[str, Any]) -> tuple[tuple[str, ...], ...]:
+    listed = {name: _checked_catids(name, some) for name, some in given.items() if some is not None}
+    taken = {catid for some in listed.values() for catid in some}
+    known = {name: (catid,) for name, (catid, _) in _PAPER.items() if catid and catid not in taken}
+    return tuple((known | listed).get(name, ()) for name in names)
+
+
+def _checked_color(name: str, color: Any) -> Color:
+    parts = tuple(color) if isinstance(color, list | tuple) else ()
+    if len(parts) != 3 or any(type(part) is not int or not 0 <= part <= 255 for part in parts):
+        raise ConfigError(
+            f"the colour {shown(color)} of the class {name} is none: give red, green and blue from 0 to 255"
+        )
+    return (parts[0], parts[1], parts[2])
+
+
+def _checked_catids(name: str, catids: Any) -> tuple[str, ...]:
+    listed = (catids,) if isinstance(catids, str) else catids
+    if not isinstance(listed, list | tuple) or any(
+        not isinstance(catid, str) or not catid for catid in listed
+    ):
+        raise ConfigError(
+            f"the categories {shown(catids)} of the class {name} are no texts: put each in quotes, "
+            'as in "03001627"'
+        )
+    return tuple(listed)
+
+
+@lru_cache(maxsize=64)
+def _label_by_category(classes: Classes) -> dict[str, int]:
+    """Return the label of every category that is listed, and of the classes' own names."""
+    by_name = {name: label for label, name in enumerate(classes.names)}
+    return by_name | {catid: label for label, some in enumerate(classes.catids) for catid in some}
+
+
+@lru_cache(maxsize=64)
+def _palette(count: int) -> tuple[Color, ...]:
+    """Return colours, each as far as can be from those before it and from the paper's.
+
+    They are points of a coarse lattice of red, green and blue, neither too dark nor too light.
+    """
+    lattice = np.stack(np.meshgrid(_LEVELS, _LEVELS, _LEVELS, indexing="ij"), axis=-1).reshape(-1, 3)
+    grey = lattice @ np.array([0.299, 0.587, 0.114])
+    lattice = lattice[(grey >= _DARKEST) & (grey <= _LIGHTEST)]
+    paper = np.array([color for _, color in _PAPER.values()])
+    nearest = ((lattice[:, None] - paper) ** 2).sum(axis=-1).min(axis=1)
+    colors = []
+    for _ in range(count):
+        best = lattice[nearest.argmax()]
+        nearest = np.minimum(nearest, ((lattice - best) ** 2).sum(axis=-1))
+        colors.append((int(best[0]), int(best[1]), int(best[2])))
+    return tuple(colors)
+
+
+PAPER_CLASSES = Classes(tuple(_PAPER))
+"""The nine of the paper, which are Scan2CAD's."""
