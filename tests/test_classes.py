@@ -35,8 +35,11 @@ def test_own_classes_get_colours_that_can_be_told_apart() -> None:
     ]
     assert min(distances) > 30
     # The first of them lie further apart, and a given colour takes nobody else's place.
-    assert Classes.of({"names": names, "colors": {"chair": [1, 2, 3]}}).colors[1:] == classes.colors[1:]
-    assert Classes.of({"names": names[1:], "colors": {"machine 3": [1, 2, 3]}}).colors[3] == (1, 2, 3)
+    assert Classes.of({"names": names, "colors": [[1, 2, 3], *[None] * 40]}).colors[1:] == classes.colors[1:]
+    assert Classes.of({"names": ["a", "b"], "colors": [None, [1, 2, 3]]}).colors == (
+        classes.colors[1],
+        (1, 2, 3),
+    )
 
 
 def test_as_many_classes_as_there_can_be() -> None:
@@ -51,10 +54,10 @@ def test_as_many_classes_as_there_can_be() -> None:
         # An annotation's category is one that a class lists, or the name of a class.
         ({"names": ["drill", "chair"]}, {"drill": 0, "03001627": 1, "chair": 1, "02818832": None}),
         ({"names": ["drill", "other"]}, {"drill": 0, "03001627": 1, "anything": 1}),
-        ({"names": ["seat", "bed"], "catids": {"seat": ["03001627", "02828884"], "bed": "02818832"}},
+        ({"names": ["seat", "bed"], "catids": [["03001627", "02828884"], "02818832"]},
          {"03001627": 0, "02828884": 0, "02818832": 1, "seat": 0, "04379243": None}),
         # What another class lists is no longer that of the paper's class.
-        ({"names": ["chair", "throne"], "catids": {"throne": "03001627"}}, {"03001627": 1, "chair": 0}),
+        ({"names": ["chair", "throne"], "catids": [None, "03001627"]}, {"03001627": 1, "chair": 0}),
     ],
 )  # fmt: skip
 def test_label_of_a_category(settings, labels) -> None:
@@ -66,7 +69,11 @@ def test_label_of_a_category(settings, labels) -> None:
     "settings",
     [
         None,
-        {"names": ["drill", "table", "lathe 2"], "colors": {"drill": [1, 2, 3]}, "catids": {"drill": "9"}},
+        {
+            "names": ["drill", "table", "lathe 2"],
+            "colors": [[1, 2, 3], None, None],
+            "catids": ["9", None, ["8"]],
+        },
     ],
 )
 def test_classes_survive_a_file(settings) -> None:
@@ -83,7 +90,7 @@ def test_classes_survive_a_file(settings) -> None:
     [
         (["drill"], "given by names"),
         ({"names": ["drill"], "colours": {}}, "given by names"),
-        ({}, "is no list"),
+        ({}, "got 0"),
         ({"names": "drill"}, "is no list"),
         ({"names": []}, "expected 1 to 500 classes, got 0"),
         ({"names": [f"c{i}" for i in range(MAX_CLASSES + 1)]}, "got 501"),
@@ -96,19 +103,22 @@ def test_classes_survive_a_file(settings) -> None:
         ({"names": [" drill"]}, "printable characters"),
         ({"names": ["dr\nill"]}, "printable characters"),
         ({"names": ["d" * 61]}, "printable characters"),
-        ({"names": ["../drill"]}, "slashes"),
+        ({"names": ["../drill"]}, "take one without"),
+        ({"names": ["${seed}"]}, "take one without"),
         ({"names": ["padding"]}, "not padding"),
-        ({"names": ["drill"], "colors": {"dril": [1, 2, 3]}}, "'dril', which is no class"),
-        ({"names": ["drill"], "colors": [[1, 2, 3]]}, "by the name of the class"),
-        ({"names": ["drill"], "colors": {"drill": [1, 2, 300]}}, "from 0 to 255"),
-        ({"names": ["drill"], "colors": {"drill": [1, 2]}}, "from 0 to 255"),
-        ({"names": ["drill"], "colors": {"drill": "red"}}, "from 0 to 255"),
-        ({"names": ["drill"], "colors": {"drill": [1.0, 2, 3]}}, "from 0 to 255"),
-        ({"names": ["drill"], "catids": {"drill": 3001627}}, "in quotes"),
-        ({"names": ["drill"], "catids": {"drill": [3001627]}}, "in quotes"),
-        ({"names": ["drill"], "catids": {"lathe": "1"}}, "'lathe', which is no class"),
-        ({"names": ["a", "b"], "catids": {"a": "1", "b": ["1"]}}, "'1' is listed twice"),
-        ({"names": ["chair", "table"], "catids": {"chair": ["1", "1"]}}, "'1' is listed twice"),
+        ({"names": ["drill"], "colors": {"drill": [1, 2, 3]}}, r"classes.colors=.* is no list"),
+        ({"names": ["drill"], "colors": [[1, 2, 3], [1, 2, 3]]}, "colors has 2 entries for 1 names"),
+        ({"names": ["drill"], "colors": [[1, 2, 300]]}, "from 0 to 255"),
+        ({"names": ["drill"], "colors": [[1, 2]]}, "from 0 to 255"),
+        ({"names": ["drill"], "colors": ["red"]}, "from 0 to 255"),
+        ({"names": ["drill"], "colors": [[1.0, 2, 3]]}, "from 0 to 255"),
+        ({"names": ["drill"], "colors": [[True, 2, 3]]}, "from 0 to 255"),
+        ({"names": ["drill"], "catids": [3001627]}, "in quotes"),
+        ({"names": ["drill"], "catids": [[3001627]]}, "in quotes"),
+        ({"names": ["drill"], "catids": ["${oc.env:HOME}"]}, "in quotes"),
+        ({"names": ["drill"], "catids": [None, None]}, "catids has 2 entries"),
+        ({"names": ["a", "b"], "catids": ["1", ["1"]]}, "'1' is listed twice"),
+        ({"names": ["chair", "table"], "catids": [["1", "1"], None]}, "'1' is listed twice"),
     ],
 )  # fmt: skip
 def test_what_is_no_list_of_classes_ends_in_a_sentence(settings, reason) -> None:
@@ -122,5 +132,5 @@ def test_a_class_that_is_not_there() -> None:
 
 
 def test_as_many_colours_as_classes() -> None:
-    with pytest.raises(ConfigError, match="2 classes need as many colours"):
+    with pytest.raises(ConfigError, match="colors has 1 entries for 2 names"):
         Classes(("a", "b"), colors=((1, 2, 3),))

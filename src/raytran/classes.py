@@ -27,8 +27,9 @@ PADDING_NAME = "padding"
 _MAX_NAME = 60
 """Characters."""
 
-_NOT_IN_NAMES = ("/", "\\")
-"""Names are parts of paths: of scores in logs, and of nodes in files of meshes and in the viewer."""
+_NOT_IN_NAMES = ("/", "\\", "$")
+"""Names are parts of paths: of scores in logs, and of nodes in files of meshes and in the viewer; and a dollar
+sign in a config refers to another setting."""
 
 _PAPER: dict[str, tuple[str, Color]] = {
     "bathtub": ("02808440", (23, 190, 207)),
@@ -71,14 +72,10 @@ class Classes:
 
     def __post_init__(self) -> None:
         _check_names(self.names)
-        colors = self.colors or _filled_colors(self.names, {})
-        catids = self.catids or _filled_catids(self.names, {})
-        if not len(colors) == len(catids) == len(self.names):
-            raise ConfigError(f"{len(self.names)} classes need as many colours and lists of categories")
         # Tuples of plain values, whatever was given: what is hashed and compared.
         object.__setattr__(self, "names", tuple(self.names))
-        object.__setattr__(self, "colors", tuple(map(_checked_color, self.names, colors)))
-        object.__setattr__(self, "catids", tuple(map(_checked_catids, self.names, catids)))
+        object.__setattr__(self, "colors", _filled_colors(self.names, self.colors))
+        object.__setattr__(self, "catids", _filled_catids(self.names, self.catids))
         listed = [catid for some in self.catids for catid in some]
         if len(set(listed)) < len(listed):
             twice = next(catid for catid in listed if listed.count(catid) > 1)
@@ -89,8 +86,9 @@ class Classes:
         """Return the classes that a config, or the description in a checkpoint, names.
 
         Args:
-            settings: ``names``, a list; and, or null, ``colors`` and ``catids`` by name: for those left out
-                see the attributes. A category, or a list of them. None: the paper's nine.
+            settings: ``names``; and ``colors`` and ``catids``, lists with an entry for each name, or left
+                out. An entry that is null stands for what ``Classes`` takes where they are left out, and a
+                text in ``catids`` for a list of it. None: the paper's nine.
 
         Raises:
             ConfigError: it is something else, or see ``Classes``.
@@ -101,20 +99,18 @@ class Classes:
             return settings
         if not isinstance(settings, Mapping) or not set(settings) <= {"names", "colors", "catids"}:
             raise ConfigError("classes are given by names, colors and catids: see conf/classes/paper.yaml")
-        names = settings.get("names")
-        if not isinstance(names, list | tuple):
-            raise ConfigError(f"classes.names={shown(names)} is no list: write it as classes.names=[a,b]")
-        _check_names(names)
-        colors = _by_name("colors", settings.get("colors"), names)
-        catids = _by_name("catids", settings.get("catids"), names)
-        return cls(tuple(names), _filled_colors(names, colors), _filled_catids(names, catids))
+        lists = {name: given for name, given in settings.items() if given is not None}
+        for name, given in lists.items():
+            if not isinstance(given, list | tuple):
+                raise ConfigError(f"classes.{name}={shown(given)} is no list: write it as [a,b]")
+        return cls(lists.get("names", ()), lists.get("colors", ()), lists.get("catids", ()))
 
     def settings(self) -> dict[str, Any]:
         """Return what ``of`` makes these classes of again: lists and texts."""
         return {
             "names": list(self.names),
-            "colors": {name: list(color) for name, color in zip(self.names, self.colors, strict=True)},
-            "catids": {name: list(some) for name, some in zip(self.names, self.catids, strict=True)},
+            "colors": [list(color) for color in self.colors],
+            "catids": [list(some) for some in self.catids],
         }
 
     def __len__(self) -> int:
@@ -165,37 +161,38 @@ def _check_names(names: Sequence[Any]) -> None:
             )
         if name == PADDING_NAME or any(character in name for character in _NOT_IN_NAMES):
             raise ConfigError(
-                f"{shown(name)} cannot be the name of a class: take one without slashes, not {PADDING_NAME}"
+                f"{shown(name)} cannot be the name of a class: take one without / \\ $, not {PADDING_NAME}"
             )
     if len(set(names)) < len(names):
         twice = next(name for name in names if list(names).count(name) > 1)
         raise ConfigError(f"the class {shown(twice)} is named twice: name each once in classes.names")
 
 
-def _by_name(what: str, given: Any, names: Sequence[str]) -> Mapping[str, Any]:
-    """Return what is given for some of the names."""
-    if given is None:
-        return {}
-    if not isinstance(given, Mapping):
-        raise ConfigError(f"classes.{what} is given by the name of the class: write it as {{{names[0]}: …}}")
-    unknown = [name for name in given if name not in names]
-    if unknown:
+def _entries(what: str, given: Sequence[Any], names: Sequence[str]) -> Sequence[Any]:
+    """Return what is given for each of the names, None where nothing is."""
+    if len(given) not in (0, len(names)):
         raise ConfigError(
-            f"classes.{what} has {shown(unknown[0])}, which is no class: choose of classes.names"
+            f"classes.{what} has {len(given)} entries for {len(names)} names: give one for each, or null"
         )
-    return given
+    return given or [None] * len(names)
 
 
-def _filled_colors(names: Sequence[str], given: Mapping[str, Any]) -> tuple[Color, ...]:
+def _filled_colors(names: Sequence[str], given: Sequence[Any]) -> tuple[Color, ...]:
     known = {name: color for name, (_, color) in _PAPER.items()} | {
-        name: _checked_color(name, color) for name, color in given.items() if color is not None
+        name: _checked_color(name, color)
+        for name, color in zip(names, _entries("colors", given, names), strict=True)
+        if color is not None
     }
     of_palette = iter(_palette(sum(name not in known for name in names)))
     return tuple(known[name] if name in known else next(of_palette) for name in names)
 
 
-def _filled_catids(names: Sequence[str], given: Mapping[str, Any]) -> tuple[tuple[str, ...], ...]:
-    listed = {name: _checked_catids(name, some) for name, some in given.items() if some is not None}
+def _filled_catids(names: Sequence[str], given: Sequence[Any]) -> tuple[tuple[str, ...], ...]:
+    listed = {
+        name: _checked_catids(name, some)
+        for name, some in zip(names, _entries("catids", given, names), strict=True)
+        if some is not None
+    }
     taken = {catid for some in listed.values() for catid in some}
     known = {name: (catid,) for name, (catid, _) in _PAPER.items() if catid and catid not in taken}
     return tuple((known | listed).get(name, ()) for name in names)
@@ -212,14 +209,17 @@ def _checked_color(name: str, color: Any) -> Color:
 
 def _checked_catids(name: str, catids: Any) -> tuple[str, ...]:
     listed = (catids,) if isinstance(catids, str) else catids
-    if not isinstance(listed, list | tuple) or any(
-        not isinstance(catid, str) or not catid for catid in listed
-    ):
+    if not isinstance(listed, list | tuple) or not all(map(_is_category, listed)):
         raise ConfigError(
-            f"the categories {shown(catids)} of the class {name} are no texts: put each in quotes, "
+            f"the categories {shown(catids)} of the class {name} are no names: put each in quotes, "
             'as in "03001627"'
         )
     return tuple(listed)
+
+
+def _is_category(value: Any) -> bool:
+    is_text = isinstance(value, str) and value.isprintable() and 0 < len(value) <= _MAX_NAME
+    return is_text and not any(character in value for character in _NOT_IN_NAMES)
 
 
 @lru_cache(maxsize=64)
