@@ -24,13 +24,14 @@ if not torch.cuda.is_available():
 
 from raytran.checkpoints.file import write_checkpoint
 from raytran.checkpoints.metadata import checkpoint_metadata
+from raytran.classes import PAPER_CLASSES
 from raytran.geometry.camera import Cameras
 from raytran.geometry.rotation import rotation_from_yaw, yaw_from_rotation
 from raytran.ops.pairs import PairList
 from raytran.rooms.generate import generate_rooms
 from raytran.run.entry import compose
 from raytran.run.train.build import build_model, plain
-from raytran.structs import PADDING, ObjectSet, RawObjects
+from raytran.structs import ObjectSet, RawObjects
 
 from .commands import Commands
 from .factories import Trained
@@ -315,7 +316,7 @@ def make_objects() -> Callable[[int, int], ObjectSet]:
     def make(count: int, seed: int = 0) -> ObjectSet:
         g = torch.Generator().manual_seed(seed)
         return ObjectSet(
-            label=torch.randint(0, PADDING, (count,), generator=g),
+            label=torch.randint(0, len(PAPER_CLASSES), (count,), generator=g),
             center=4 * torch.rand(count, 3, generator=g) - 2,
             size=torch.rand(count, 3, generator=g) + 0.3,
             rotation=rotation_from_yaw(6 * torch.rand(count, generator=g) - 3),
@@ -330,9 +331,9 @@ def make_objects() -> Callable[[int, int], ObjectSet]:
 @pytest.fixture
 def make_perfect() -> Callable[..., RawObjects]:
     def make(objects: ObjectSet, slots: torch.Tensor, num_queries: int) -> RawObjects:
-        logits = torch.full((1, num_queries, PADDING + 1), -20.0)
-        logits[0, :, PADDING] = 20.0
-        logits[0, slots, PADDING] = -20.0
+        logits = torch.full((1, num_queries, len(PAPER_CLASSES) + 1), -20.0)
+        logits[0, :, len(PAPER_CLASSES)] = 20.0
+        logits[0, slots, len(PAPER_CLASSES)] = -20.0
         logits[0, slots, objects.label] = 20.0
         center, log_size = 9 * torch.ones(1, num_queries, 3), torch.zeros(1, num_queries, 3)
         center[0, slots], log_size[0, slots] = objects.center, objects.size.log()

@@ -13,6 +13,7 @@ import pytest
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
+from raytran.classes import Classes
 from raytran.errors import ConfigError
 from raytran.postprocess import DUPLICATE_IOU, SCORE_THRESHOLD
 from raytran.rooms.generate import generate_rooms
@@ -137,6 +138,11 @@ def test_the_papers_preset_is_the_default_of_the_code():
                     wanted = (
                         list(parameter.default) if isinstance(parameter.default, tuple) else parameter.default
                     )
+                    if isinstance(wanted, Classes) or name == "classes":
+                        given_names = node[name]["names"] if isinstance(node[name], dict) else node[name]
+                        wanted_names = wanted if isinstance(wanted, list) else Classes.of(wanted).names
+                        assert list(wanted_names) == list(given_names), f"{node['_target_']}.{name}"
+                        continue
                     assert node[name] == wanted, f"{node['_target_']}.{name}"
 
 

@@ -13,6 +13,7 @@ from hydra import initialize_config_dir
 from hydra.utils import get_class, instantiate
 from omegaconf import OmegaConf
 
+from raytran.classes import Classes
 from raytran.run.config_dir import config_dir
 from raytran.run.entry import compose
 from raytran.run.train.build import build_data, build_model, build_module, plain
@@ -65,7 +66,19 @@ def build_everything(config) -> None:
 def test_no_folder_is_forgotten():
     folders = {str(path.parent) for path in FILES} - {"local"}
     assert folders == {
-        *(".", "data", "debug", "experiment", "logger", "loss", "model", "preset", "stage", "sweep"),
+        *(
+            ".",
+            "classes",
+            "data",
+            "debug",
+            "experiment",
+            "logger",
+            "loss",
+            "model",
+            "preset",
+            "stage",
+            "sweep",
+        ),
         *("trainer", "variant", "hydra", "hydra/launcher", "hydra/sweeper", *PARTS_OF_THE_MODEL),
     }
 
@@ -97,6 +110,18 @@ def test_presets(path):
 @pytest.mark.parametrize("path", files("data"), ids=name)
 def test_data(path):
     build_data(chosen(path, "data.root=somewhere"))
+
+
+@pytest.mark.parametrize("path", files("classes"), ids=name)
+def test_classes(path):
+    config = chosen(path)
+    names = config.classes.names
+    build_everything(config)
+    model = build_model(config, pretrained=False)
+    assert model.classes == Classes.of(plain(config.classes))
+    assert model.class_layers()
+    sizes = {shape for layer in model.class_layers() for shape in model.get_submodule(layer).weight.shape}
+    assert {len(names), len(names) + 1} <= sizes
 
 
 @pytest.mark.parametrize("path", files("experiment"), ids=name)

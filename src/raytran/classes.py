@@ -28,7 +28,7 @@ _MAX_NAME = 60
 """Characters."""
 
 _NOT_IN_NAMES = ("/", "\\", "$")
-"""Names are parts of paths: of scores in logs, and of nodes in files of meshes and in the viewer; and a dollar
+"""Names are parts of paths: of scores in logs, and of nodes in files of meshes and in the viewer. A dollar
 sign in a config refers to another setting."""
 
 _PAPER: dict[str, tuple[str, Color]] = {
@@ -116,6 +116,15 @@ class Classes:
     def __len__(self) -> int:
         return len(self.names)
 
+    def difference(self, other: Classes) -> str | None:
+        """Say in a few words how the names of ``other`` differ from these; None if they are the same."""
+        if self.names == other.names:
+            return None
+        added = [name for name in other.names if name not in self.names]
+        lacking = [name for name in self.names if name not in other.names]
+        parts = [f"with {shown(added[0])}"] * bool(added) + [f"without {shown(lacking[0])}"] * bool(lacking)
+        return f"{len(other)} classes {' and '.join(parts) or 'in another order'}"
+
     def index(self, name: str) -> int:
         """Return the label of a class.
 
@@ -155,9 +164,11 @@ def _check_names(names: Sequence[Any]) -> None:
     for name in names:
         if not isinstance(name, str):
             raise ConfigError(f'the class {shown(name)} is no text: put it in quotes, as in "{shown(name)}"')
-        if not name or name != name.strip() or not name.isprintable() or len(name) > _MAX_NAME:
+        is_proper = name[:1].isalnum() and name == name.rstrip() and name.isprintable()
+        if not is_proper or len(name) > _MAX_NAME:
             raise ConfigError(
-                f"{shown(name)} is no name of a class: give 1 to {_MAX_NAME} printable characters"
+                f"{shown(name)} is no name of a class: give 1 to {_MAX_NAME} printable characters, the first "
+                "of them a letter or digit"
             )
         if name == PADDING_NAME or any(character in name for character in _NOT_IN_NAMES):
             raise ConfigError(
@@ -250,3 +261,7 @@ def _palette(count: int) -> tuple[Color, ...]:
 
 PAPER_CLASSES = Classes(tuple(_PAPER))
 """The nine of the paper, which are Scan2CAD's."""
+
+SCAN2CAD_CLASS_BY_CATID: dict[str, str] = {catid: name for name, (catid, _) in _PAPER.items() if catid}
+"""Class of each ShapeNet category in Scan2CAD's protocols, whatever a network's classes are; every other
+category is ``other``."""

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from raytran.backbone.backbone import VoxelBackbone
+from raytran.classes import Classes
 from raytran.errors import ConfigError, ShapeError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.checks import check_views
@@ -69,10 +70,11 @@ class RayTran(nn.Module):
         rays_per_cell: n×n rays join a cell of the feature map with the voxels they cross.
         attention: what computes ray-traced attention: ``fused`` Triton kernels, products of ``torch.sparse``
             (``sparse``), or the former where they run and the latter elsewhere (``auto``).
+        classes: of the objects, or their settings, see ``Classes.of``; None: the paper's nine.
 
     Raises:
         ConfigError: the foreground or view head does not grow the features back to image size, there is no
-            such attention, or no such voxel grid.
+            such attention, or no such voxel grid; classes are none, or the object head has another number.
     """
 
     def __init__(
@@ -84,8 +86,17 @@ class RayTran(nn.Module):
         grid_extent: Sequence[float] = (9.0, 9.0, 3.5),
         rays_per_cell: int = 2,
         attention: Attention = "auto",
+        classes: Classes | Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
+        self.classes = Classes.of(classes)
+        # An object head of the user's own need not tell.
+        of_head = getattr(heads["objects"], "num_classes", None) if "objects" in heads else None
+        if of_head not in (None, len(self.classes)):
+            raise ConfigError(
+                f"the network has {len(self.classes)} classes and its object head {of_head}: name them in "
+                "classes.names, from which both take them"
+            )
         for name in ("foreground", "view"):
             if name in heads and heads[name].stride != backbone.stride:
                 raise ConfigError(
@@ -238,6 +249,18 @@ class RayTran(nn.Module):
         """Return shape logits ``(M, S, S, S)`` of query embeddings ``(M, C)``."""
         return self.heads["shape"](embedding)
 
+    def class_layers(self) -> tuple[str, ...]:
+        """Return the names of the parts whose size or meaning is that of the classes, as their modules say.
+
+        A module of your own lists them, as seen from itself, in an attribute ``class_layers``.
+        """
+        return tuple(
+            f"{name}.{part}"
+            for name, module in self.named_modules()
+            if module is not self
+            for part in getattr(module, "class_layers", ())
+        )
+
     def idle_modules(self, tasks: Collection[str]) -> tuple[str, ...]:
         """Return the names of the sub-modules that get no gradient when ``forward`` is asked for ``tasks``.
 
@@ -363,8 +386,10 @@ class RayTran(nn.Module):
 
     def _objects(self, raw: RawScene, scene: int, score_threshold: float, with_shapes: bool) -> ObjectSet:
         if raw.objects is None:
-            return ObjectSet.empty().to(raw.grid_center.device)
-        objects, embedding = objects_of_queries(raw.objects[-1], scene, score_threshold=score_threshold)
+            return ObjectSet.empty(self.classes).to(raw.grid_center.device)
+        objects, embedding = objects_of_queries(
+            raw.objects[-1], scene, score_threshold=score_threshold, classes=self.classes
+        )
         if not with_shapes or "shape" not in self.heads:
             return objects
         # What a forward pass under autocast left in 16 bits is decoded outside of it.

@@ -25,41 +25,8 @@ from typing import Any, TypeVar, cast
 import torch
 from torch import Tensor
 
-from raytran.classes import PAPER_CLASSES, Classes
+from raytran.classes import OTHER, PAPER_CLASSES, SCAN2CAD_CLASS_BY_CATID, Classes
 from raytran.errors import DataError
-
-CLASSES: tuple[str, ...] = (
-    *("bathtub", "bookshelf", "cabinet", "chair", "display", "sofa", "table", "trashbin", "other"),
-)
-"""Class names in the order of their labels; a network adds the padding class behind them (RayTran §3.2)."""
-
-CLASS_BY_CATID: dict[str, str] = {
-    "02808440": "bathtub",
-    "02871439": "bookshelf",
-    "02933112": "cabinet",
-    "03001627": "chair",
-    "03211117": "display",
-    "04256520": "sofa",
-    "04379243": "table",
-    "02747177": "trashbin",
-}
-"""Class of each ShapeNet category (Scan2CAD EvaluateBenchmark.py); every other category is ``other``."""
-
-CLASS_COLORS: tuple[tuple[int, int, int], ...] = (
-    (23, 190, 207),
-    (140, 86, 75),
-    (255, 127, 14),
-    (31, 119, 180),
-    (148, 103, 189),
-    (214, 39, 40),
-    (44, 160, 44),
-    (227, 119, 194),
-    (127, 127, 127),
-)
-"""Red, green, blue in [0, 255] of each class, in the order of ``CLASSES``, in pictures and meshes alike."""
-
-PADDING: int = len(CLASSES)
-"""Label of the padding class: the query holds no object."""
 
 SHAPE_SIZE: int = 63
 """Cells along each side of an object's shape grid (RayTran §3.2)."""
@@ -270,6 +237,23 @@ class ObjectSet(TensorStruct):
         """Name of each object's class; on a GPU the host waits for the labels."""
         return self.classes.names_of(self.label.tolist())
 
+    def check_classes(self, classes: Classes, whose: str) -> None:
+        """Raise unless the labels stand for ``classes``; without objects there are none.
+
+        Args:
+            classes: what they must stand for.
+            whose: whose classes these are, e.g. ``the network``.
+
+        Raises:
+            DataError: they stand for others.
+        """
+        difference = classes.difference(self.classes) if len(self) else None
+        if difference is not None:
+            raise DataError(
+                f"objects are of {difference}, and {whose} has {len(classes)} ({classes}): "
+                "give both the same classes"
+            )
+
     def select(self, index: Tensor) -> ObjectSet:
         """Return the objects at ``index``, an int64 ``(M',)`` or bool ``(M,)`` tensor, in that order."""
         return self._select(len(self), index)
@@ -291,10 +275,10 @@ class ObjectSet(TensorStruct):
             DataError: the sets do not have the same classes.
         """
         for objects in sets:
-            if objects.classes.names != sets[0].classes.names:
+            if (difference := sets[0].classes.difference(objects.classes)) is not None:
                 raise DataError(
-                    f"objects of the classes {objects.classes} cannot stand in one set with objects of "
-                    f"{sets[0].classes}: read them with the same classes"
+                    f"objects of {len(sets[0].classes)} classes cannot stand in one set with objects of "
+                    f"{difference}: read them with the same classes"
                 )
         some = [objects for objects in sets if len(objects)] or list(sets[:1])
 
@@ -352,8 +336,8 @@ class CadAlignments(TensorStruct):
 
     @property
     def category(self) -> tuple[str, ...]:
-        """Class of each model."""
-        return tuple(CLASS_BY_CATID.get(catid, "other") for catid in self.catid)
+        """Class of each model, of Scan2CAD's nine."""
+        return tuple(SCAN2CAD_CLASS_BY_CATID.get(catid, OTHER) for catid in self.catid)
 
     def select(self, index: Tensor) -> CadAlignments:
         """Return the models at ``index``, an int64 ``(M',)`` or bool ``(M,)`` tensor, in that order."""

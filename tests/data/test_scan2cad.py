@@ -10,6 +10,7 @@ import math
 import pytest
 import torch
 
+from raytran.classes import PAPER_CLASSES
 from raytran.data.scan2cad import read_annotations, scene_alignments, scene_objects
 from raytran.errors import DataError
 from raytran.geometry.rotation import (
@@ -18,7 +19,7 @@ from raytran.geometry.rotation import (
     rotation_from_yaw,
     yaw_from_rotation,
 )
-from raytran.structs import CLASSES, SYMMETRY_INFINITE
+from raytran.structs import SYMMETRY_INFINITE
 
 IDENTITY = {"translation": [0, 0, 0], "rotation": [1, 0, 0, 0], "scale": [1, 1, 1]}
 
@@ -30,7 +31,7 @@ def objects_of(path, scene_id="scene0000_00"):
 def test_upright_cube(write_annotations, cube_entry) -> None:
     objects = objects_of(write_annotations({"scene0000_00": [cube_entry(scale=(1.0, 2.0, 3.0))]}))
     assert len(objects) == 1
-    assert objects.label.tolist() == [CLASSES.index("chair")]
+    assert objects.label.tolist() == [PAPER_CLASSES.index("chair")]
     assert objects.model_id == ("03001627/cube",)
     assert objects.score.tolist() == [1.0]
     assert objects.shape is None
@@ -73,7 +74,7 @@ def test_classes_and_symmetries(write_annotations, cube_entry) -> None:
     entries = [cube_entry(catid_cad=c, sym=s) for c, s in zip(catids, symmetries, strict=True)]
     objects = objects_of(write_annotations({"scene0000_00": entries}))
     # A file cabinet is no cabinet in Scan2CAD's benchmark, and a bed no class of its own.
-    assert [CLASSES[i] for i in objects.label] == ["table", "other", "trashbin", "other"]
+    assert [PAPER_CLASSES.names[i] for i in objects.label] == ["table", "other", "trashbin", "other"]
     assert objects.symmetry.tolist() == [2, 4, SYMMETRY_INFINITE, 1]
 
 
@@ -120,7 +121,7 @@ def test_real_annotation(shared_dir) -> None:
     root = shared_dir / "realdata" / "scene0470_00"
     objects = scene_objects(read_annotations(root / "scan2cad" / "full_annotations.json")["scene0470_00"])
     expected = json.loads((root / "reference" / "objects_scan_frame.json").read_text())["objects"]
-    assert [CLASSES[i] for i in objects.label] == [o["class_name"] for o in expected]
+    assert [PAPER_CLASSES.names[i] for i in objects.label] == [o["class_name"] for o in expected]
     assert objects.model_id == tuple(f"{o['catid_cad']}/{o['id_cad']}" for o in expected)
     assert objects.symmetry.tolist() == [2, 1, 1, 1, 1, SYMMETRY_INFINITE, 1]
     millimetre = {"atol": 1e-3, "rtol": 0.0}
@@ -153,7 +154,7 @@ def test_alignments_are_the_poses_taken_apart(shared_dir) -> None:
     torch.testing.assert_close(centre.float(), objects.center)
     torch.testing.assert_close((2 * alignments.half_extent * alignments.scale).float(), objects.size)
     assert alignments.model_id == objects.model_id
-    assert alignments.category == tuple(CLASSES[label] for label in objects.label.tolist())
+    assert alignments.category == tuple(PAPER_CLASSES.names[label] for label in objects.label.tolist())
     assert alignments.symmetry.tolist() == [2, 1, 1, 1, 1, SYMMETRY_INFINITE, 1]
 
 

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import torch
 
+from raytran.classes import PAPER_CLASSES
 from raytran.rooms.generate import generate_rooms
-from raytran.structs import CLASSES
 
 from ..test_layers import violations
 
@@ -257,6 +257,6 @@ def test_a_class_list(copy, sections, rooms):
     assert "val/objects/accuracy/bed" in logged(copy / "of-ten")
     state = torch.load(copy / "of-ten" / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
     shapes = {name: value.shape for name, value in state.items() if name.endswith("category.weight")}
-    assert {shape[0] - len(CLASSES) for shape in shapes.values()} >= {1, 2}, (
+    assert {shape[0] - len(PAPER_CLASSES) for shape in shapes.values()} >= {1, 2}, (
         "with the padding class, and without"
     )

@@ -12,6 +12,7 @@ import pytest
 import torch
 import trimesh
 
+from raytran.classes import PAPER_CLASSES
 from raytran.data.scan2cad import read_annotations, scene_alignments, scene_objects
 from raytran.data.shapenet.models import model_names, read_mesh
 from raytran.data.shapenet.voxelize import voxelize_solid
@@ -19,7 +20,7 @@ from raytran.errors import DataError
 from raytran.export import nearest_cad as module
 from raytran.export.nearest_cad import nearest_cads
 from raytran.geometry.rotation import matrix_from_quaternion, rotation_from_yaw
-from raytran.structs import CLASSES, ObjectSet
+from raytran.structs import ObjectSet
 
 CHAIR, TABLE, LAMP = "03001627", "04379243", "03636649"
 SIDE = 21
@@ -70,7 +71,7 @@ def objects_like(library: Path, *wanted: tuple[str, str], noise: float = 0.0) ->
     sizes = np.stack([np.ptp(mesh.vertices, axis=0) for mesh in meshes]) * stretch
     labels = [{CHAIR: "chair", TABLE: "table"}.get(catid, "other") for catid, _ in wanted]
     return ObjectSet(
-        label=torch.tensor([CLASSES.index(label) for label in labels]),
+        label=torch.tensor([PAPER_CLASSES.index(label) for label in labels]),
         center=torch.from_numpy(rng.uniform(0, 4, (len(wanted), 3))).float(),
         size=torch.from_numpy(sizes).float(),
         rotation=rotation_from_yaw(torch.arange(len(wanted)).float()),

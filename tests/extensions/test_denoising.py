@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import torch
 
+from raytran.classes import PAPER_CLASSES
 from raytran.errors import ConfigError
 from raytran.extensions.denoising import (
     CENTER_NOISE,
@@ -51,7 +52,7 @@ def copies_beside(kind: str, num_copies: int = 300) -> tuple[NoisyCopies, Querie
         if kind == "learned"
         else ProposalQueries(channels=8, num_queries=5)
     )
-    network = NoisyCopies(channels=8, num_copies=num_copies)
+    network = NoisyCopies(channels=8, num_copies=num_copies, num_classes=len(PAPER_CLASSES))
     return network, network(truth(), queries(torch.randn(2, 4, 4, 2, 8), GRID), GRID)
 
 

@@ -10,11 +10,12 @@ import torch.nn.functional as F
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
+from raytran.classes import PAPER_CLASSES
 from raytran.geometry.rotation import symmetric_yaw_error, yaw_from_rotation
 from raytran.losses.matcher import HungarianMatcher
 from raytran.losses.objects import yaw_from_vector
 from raytran.losses.total import TotalLoss
-from raytran.structs import PADDING, ObjectSet, RawObjects
+from raytran.structs import ObjectSet, RawObjects
 
 
 def pose_errors_of(center: Tensor, log_size: Tensor, yaw_vector: Tensor, target: ObjectSet, betas) -> dict:
@@ -43,11 +44,11 @@ def match_scene(matcher: HungarianMatcher, raw: RawObjects, scene: int, objects:
 def object_terms(loss: TotalLoss, layers: Sequence[RawObjects], targets: Sequence[ObjectSet]) -> dict:
     """Return the terms of the objects, by the names that ``TotalLoss`` gives them."""
     found = {}
-    weight = torch.ones(PADDING + 1, dtype=layers[0].center.dtype)
-    weight[PADDING] = loss.no_object_weight
+    weight = torch.ones(len(PAPER_CLASSES) + 1, dtype=layers[0].center.dtype)
+    weight[len(PAPER_CLASSES)] = loss.no_object_weight
     count = sum(map(len, targets)) or len(targets)
     for index, raw in enumerate(layers):
-        label = torch.full(raw.class_logits.shape[:2], PADDING)
+        label = torch.full(raw.class_logits.shape[:2], len(PAPER_CLASSES))
         terms = dict.fromkeys(("center", "size", "yaw"), raw.center.new_zeros(()))
         for scene, objects in enumerate(targets):
             query, target = match_scene(loss.matcher, raw, scene, objects)

@@ -6,10 +6,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from raytran.classes import PAPER_CLASSES
 from raytran.errors import ConfigError
 from raytran.losses.matcher import HungarianMatcher
 from raytran.losses.objects import Differences, Match, TrueObjects
-from raytran.structs import PADDING, ObjectSet, RawObjects
+from raytran.structs import ObjectSet, RawObjects
 
 WEIGHTS = {"class": 1.0, "center": 2.0, "size": 1.0, "yaw": 1.0}
 
@@ -44,7 +45,7 @@ def test_finds_a_planted_permutation(make_objects, make_perfect, blind) -> None:
 def test_a_likely_class_costs_less(make_objects) -> None:
     """Minus the probability of the object's class, so that what suits best costs least."""
     objects = replace(make_objects(2), label=torch.tensor([3, 6]))
-    logits = torch.randn(1, 4, PADDING + 1, generator=torch.Generator().manual_seed(1))
+    logits = torch.randn(1, 4, len(PAPER_CLASSES) + 1, generator=torch.Generator().manual_seed(1))
     logits[0, 2, 3] = 8.0
     rest = [torch.zeros(1, 4, size) for size in (3, 3, 2, 4)]
     matcher = HungarianMatcher(weights={"class": 1.0, "center": 0.0, "size": 0.0, "yaw": 0.0})
@@ -56,7 +57,7 @@ def test_a_likely_class_costs_less(make_objects) -> None:
 def test_the_class_may_cost_its_cross_entropy(make_objects) -> None:
     """A query that is sure of a wrong class then loses its object to one that is nowhere near."""
     objects = replace(make_objects(1), label=torch.tensor([3]))
-    logits = torch.zeros(1, 2, PADDING + 1)
+    logits = torch.zeros(1, 2, len(PAPER_CLASSES) + 1)
     logits[0, 0, 6] = 12.0  # query 0 stands where the object does, query 1 a metre away
     center = objects.center + torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     raw = RawObjects(

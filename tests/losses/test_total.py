@@ -8,6 +8,7 @@ from typing import TypeVar
 import pytest
 import torch
 
+from raytran.classes import PAPER_CLASSES
 from raytran.errors import ConfigError, DataError
 from raytran.extensions.denoising import DenoisingLoss
 from raytran.extensions.proposal_queries import ProposalLoss, ProposalQueries
@@ -17,7 +18,7 @@ from raytran.heads.objects import ObjectHead
 from raytran.losses.matcher import HungarianMatcher
 from raytran.losses.objects import TrueObjects
 from raytran.losses.total import TotalLoss
-from raytran.structs import PADDING, ObjectSet, RawObjects, RawProposals, RawScene, SceneBatch, Views
+from raytran.structs import ObjectSet, RawObjects, RawProposals, RawScene, SceneBatch, Views
 
 RawStruct = TypeVar("RawStruct", RawObjects, RawProposals)
 WEIGHTS = {
@@ -79,12 +80,12 @@ def test_class_term_is_the_weighted_mean_over_all_slots(padding, make_objects) -
     raw = RawObjects(*(torch.randn(2, 5, size, generator=g) for size in (10, 3, 3, 2, 4)))
     matcher = HungarianMatcher(weights=WEIGHTS)
     loss = TotalLoss(weights=WEIGHTS, matcher=matcher, no_object_weight=padding)
-    label = torch.full((2, 5), PADDING)
+    label = torch.full((2, 5), len(PAPER_CLASSES))
     true = TrueObjects.of(*scenes)
     match = matcher(RawObjects.stack([raw]), true, [len(objects) for objects in scenes])
     label.view(-1)[match.query[0]] = true.label[match.target[0]]
-    weight = torch.ones(PADDING + 1)
-    weight[PADDING] = padding
+    weight = torch.ones(len(PAPER_CLASSES) + 1)
+    weight[len(PAPER_CLASSES)] = padding
     expected = torch.nn.functional.cross_entropy(
         raw.class_logits.flatten(0, 1), label.flatten(), weight=weight
     )

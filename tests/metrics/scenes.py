@@ -6,10 +6,11 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from raytran.classes import PAPER_CLASSES
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.structs import CLASSES, ObjectSet
+from raytran.structs import ObjectSet
 
-CHAIR = CLASSES.index("chair")
+CHAIR = PAPER_CLASSES.index("chair")
 
 
 def objects(label, center, *, size=1.0, yaw=0.0, score=1.0) -> ObjectSet:

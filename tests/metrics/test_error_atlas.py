@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 import torch
 
+from raytran.classes import PAPER_CLASSES
 from raytran.metrics import Scan2CADAccuracy
 from raytran.metrics.error_atlas import CAUSES, FATES, ErrorAtlas
-from raytran.structs import CLASSES, ObjectSet
+from raytran.structs import ObjectSet
 
 from .scenes import CHAIR, objects, random_scene
 
-TABLE = CLASSES.index("table")
+TABLE = PAPER_CLASSES.index("table")
 
 
 CHAIR_HERE = objects([CHAIR], [[0, 0, 0]])

@@ -10,12 +10,13 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from raytran.classes import PAPER_CLASSES
 from raytran.errors import ConfigError, ShapeError
 from raytran.metrics import Scan2CADAccuracy
-from raytran.structs import CLASSES, ObjectSet
+from raytran.structs import ObjectSet
 
 UPRIGHT = Rotation.from_rotvec([np.pi / 2, 0, 0])
-CHAIR, TABLE, BIN = (CLASSES.index(name) for name in ("chair", "table", "trashbin"))
+CHAIR, TABLE, BIN = (PAPER_CLASSES.index(name) for name in ("chair", "table", "trashbin"))
 
 
 def objects(label, center, *, size=None, rotation=None, symmetry=None, score=None) -> ObjectSet:
@@ -80,8 +81,8 @@ def slow_rotation_error(predicted: Rotation, true: Rotation, symmetry: int) -> f
 
 
 def slow_counts(scenes) -> tuple[dict[int, int], dict[int, int]]:
-    good = dict.fromkeys(range(len(CLASSES)), 0)
-    total = dict.fromkeys(range(len(CLASSES)), 0)
+    good = dict.fromkeys(range(len(PAPER_CLASSES)), 0)
+    total = dict.fromkeys(range(len(PAPER_CLASSES)), 0)
     for prediction, target in scenes:
         free = list(range(len(target)))
         for label in target.label.tolist():
@@ -116,7 +117,7 @@ def test_equals_slow_computation():
     result = metric.compute()
 
     assert 0.2 < sum(good.values()) / sum(total.values()) < 0.9  # the scenes say something
-    for label, name in enumerate(CLASSES):
+    for label, name in enumerate(PAPER_CLASSES.names):
         assert result["per_class"][name]["n_good"] == good[label]
         assert result["per_class"][name]["n_total"] == total[label]
     occurring = [label for label in total if total[label]]

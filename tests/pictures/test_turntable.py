@@ -9,9 +9,10 @@ import torch
 import trimesh
 from PIL import Image
 
+from raytran.classes import PAPER_CLASSES
 from raytran.geometry.camera import Cameras
 from raytran.pictures.turntable import SIZE, draw_turntable, turntable_frames
-from raytran.structs import CLASS_COLORS, ObjectSet
+from raytran.structs import ObjectSet
 
 CHAIR, SOFA = 3, 5
 UPRIGHT = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -43,7 +44,7 @@ def walk() -> Cameras:
 def pixels_of(picture: Image.Image, label: int) -> np.ndarray:
     """Return ``(n, 2)`` row and column of the pixels in the hue of a class."""
     values = np.asarray(picture).astype(float)
-    color = np.array(CLASS_COLORS[label], dtype=float)
+    color = np.array(PAPER_CLASSES.colors[label], dtype=float)
     # By direction in RGB, as light scales it.
     cosine = (values @ color) / np.linalg.norm(values, axis=-1).clip(1) / np.linalg.norm(color)
     return np.argwhere(cosine > 0.985)

@@ -11,9 +11,9 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from raytran.classes import PAPER_CLASSES
 from raytran.errors import ConfigError
 from raytran.rooms.cad import RECIPES, CadModel, finish_model, sample_model
-from raytran.structs import CLASSES
 
 EVERY_RECIPE = [(category, recipe) for category, recipes in RECIPES.items() for _, recipe in recipes]
 NAMES = [f"{category}-{recipe.__name__}" for category, recipe in EVERY_RECIPE]
@@ -112,7 +112,10 @@ def draws(category: str) -> list[CadModel]:
 
 
 def test_kinds_of_the_issue_are_all_drawn() -> None:
-    drawn = {category: {(model.kind, model.symmetry) for model in draws(category)} for category in CLASSES}
+    drawn = {
+        category: {(model.kind, model.symmetry) for model in draws(category)}
+        for category in PAPER_CLASSES.names
+    }
     assert drawn["chair"] >= {
         ("dining chair", 1),
         ("armed chair", 1),
@@ -131,7 +134,7 @@ def test_kinds_of_the_issue_are_all_drawn() -> None:
 
 
 def test_catids_are_those_of_scan2cad() -> None:
-    found = {category: {model.catid for model in draws(category)} for category in CLASSES}
+    found = {category: {model.catid for model in draws(category)} for category in PAPER_CLASSES.names}
     assert found == {
         "bathtub": {"02808440"},
         "bookshelf": {"02871439"},
@@ -145,7 +148,7 @@ def test_catids_are_those_of_scan2cad() -> None:
     }
 
 
-@pytest.mark.parametrize("category", CLASSES)
+@pytest.mark.parametrize("category", PAPER_CLASSES.names)
 def test_a_seed_names_one_model(category: str) -> None:
     first, again = (sample_model(category, np.random.default_rng(7)) for _ in range(2))
     other = sample_model(category, np.random.default_rng(8))

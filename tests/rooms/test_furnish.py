@@ -7,12 +7,12 @@ from functools import cache
 import numpy as np
 import pytest
 
+from raytran.classes import PAPER_CLASSES
 from raytran.rooms.furnish import Furnisher
 from raytran.rooms.layout import Layout
 from raytran.rooms.library import ModelPool
 from raytran.rooms.objects import FLOOR
 from raytran.rooms.room import make_room
-from raytran.structs import CLASSES
 
 
 @cache
@@ -75,4 +75,4 @@ def test_displays_stand_on_furniture_and_look_the_way_of_the_desk():
 def test_all_classes_occur():
     kinds = ["office", "living", "bedroom", "dining", "meeting", "bathroom"]
     counts = Counter(p.model.category for kind in kinds for seed in range(2) for p in furnished(kind, seed))
-    assert set(counts) == set(CLASSES)
+    assert set(counts) == set(PAPER_CLASSES.names)

@@ -4,8 +4,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from raytran.classes import SCAN2CAD_CLASS_BY_CATID
 from raytran.rooms.kinds import KINDS, KNOWN_CATIDS, draw_size, guess_kind
-from raytran.structs import CLASS_BY_CATID
 
 EXTENTS = [(1, 1, 1), (2, 1, 0.5), (0.5, 1, 0.4), (0.2, 1, 0.2), (1, 0.2, 0.1), (1, 0.3, 0.8), (0.1, 0.1, 1)]
 
@@ -21,7 +21,7 @@ def test_sizes_keep_proportions_and_are_of_furniture(catid, extent):
     assert (sizes[:, 1] <= 2.2 + 1e-9).all()
     kind = KINDS[guess_kind(catid, extent)]
     assert kind.catid == catid
-    assert kind.category == CLASS_BY_CATID.get(catid, "other")
+    assert kind.category == SCAN2CAD_CLASS_BY_CATID.get(catid, "other")
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,12 @@ import pytest
 import torch
 import trimesh
 
+from raytran.classes import PAPER_CLASSES, SCAN2CAD_CLASS_BY_CATID
 from raytran.data.scan2cad import read_annotations, scene_objects
 from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
 from raytran.rooms.statistics import listed_scans, look, rooms_statistics
-from raytran.structs import CLASS_BY_CATID, CLASSES, ObjectSet
+from raytran.structs import ObjectSet
 
 B = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
@@ -68,7 +69,7 @@ def test_numbers_are_those_of_the_annotation(room):
     assert part["objects_per_room"] == dict.fromkeys(part["objects_per_room"], count)
     assert part["rooms_with_at_most"] == {"10": 1, "20": 1, "30": 1}
     assert sum(of["objects"] for of in part["by_class"].values()) == count
-    for catid, name in CLASS_BY_CATID.items():
+    for catid, name in SCAN2CAD_CLASS_BY_CATID.items():
         assert part["by_class"][name]["objects"] == sum(model["catid_cad"] == catid for model in models)
     # The walk was planned to see every object three times at least; a frame that sees a corner counts there.
     assert 1 <= part["sight"]["frames_per_object"]["min"] <= part["sight"]["frames_per_object"]["max"] <= 20
@@ -80,7 +81,7 @@ def test_sizes_are_medians_of_each_class(room):
     (annotation,) = read_annotations(room / "scan2cad" / "full_annotations.json").values()
     objects = scene_objects(annotation)
     by_class = rooms_statistics(room)["train"]["by_class"]
-    for index, name in enumerate(CLASSES):
+    for index, name in enumerate(PAPER_CLASSES.names):
         sizes = objects.size[objects.label == index]
         expected = [round(side, 2) for side in sizes.median(dim=0).values.tolist()] if len(sizes) else None
         assert by_class[name]["size_m"] == expected

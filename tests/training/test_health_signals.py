@@ -4,9 +4,10 @@ from __future__ import annotations
 import pytest
 import torch
 
+from raytran.classes import PAPER_CLASSES
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.losses.matcher import HungarianMatcher
-from raytran.structs import PADDING, ObjectSet, RawObjects
+from raytran.structs import ObjectSet, RawObjects
 from raytran.training.health_signals import gradient_norms, slot_signals
 
 MATCHER = HungarianMatcher(weights={"class": 1.0, "center": 5.0, "size": 1.0, "yaw": 1.0})
@@ -28,7 +29,8 @@ def slots(*labels: int, sureness: float = 50.0) -> RawObjects:
     """Slots at (0, 0, 0), (1, 1, 1), …, each sure of a class."""
     count = len(labels)
     return RawObjects(
-        class_logits=sureness * torch.nn.functional.one_hot(torch.tensor([labels]), PADDING + 1).float(),
+        class_logits=sureness
+        * torch.nn.functional.one_hot(torch.tensor([labels]), len(PAPER_CLASSES) + 1).float(),
         center=torch.arange(count).float()[None, :, None].expand(1, count, 3),
         log_size=torch.zeros(1, count, 3),
         yaw_vector=torch.tensor([0.0, 1.0]).expand(1, count, 2),
@@ -37,7 +39,7 @@ def slots(*labels: int, sureness: float = 50.0) -> RawObjects:
 
 
 def test_matched_slots_are_judged_by_their_class() -> None:
-    signals = slot_signals(slots(3, 5, PADDING, PADDING), [truth(3, 6)], MATCHER)
+    signals = slot_signals(slots(3, 5, len(PAPER_CLASSES), len(PAPER_CLASSES)), [truth(3, 6)], MATCHER)
     assert signals["class_accuracy"] == pytest.approx(0.5)
     assert signals["slots_used"] == pytest.approx(0.5)
     assert signals["class_entropy"] == pytest.approx(0.0, abs=1e-6)
@@ -49,7 +51,7 @@ def test_undecided_slots_have_all_the_entropy() -> None:
 
 
 def test_a_scene_without_objects_has_no_accuracy() -> None:
-    signals = slot_signals(slots(PADDING, 2), [truth()], MATCHER)
+    signals = slot_signals(slots(len(PAPER_CLASSES), 2), [truth()], MATCHER)
     assert set(signals) == {"class_entropy", "slots_used"}
 
 

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from raytran.structs import CLASS_COLORS
+from raytran.classes import PAPER_CLASSES
 from raytran.viewer.attention import ReadPixels
 from raytran.viewer.data import read_viewer_scene
 
@@ -54,7 +54,7 @@ def test_everything_has_a_node(server, nodes):
     assert {"/truth/sofa/05", "/frames/0004", "/voxels", "/grid"} <= names(server)
     assert len(nodes.objects) == len(nodes.truth) == 6
     assert len(nodes.frames) == 5
-    assert nodes.objects[3].solid.color == CLASS_COLORS[3]
+    assert nodes.objects[3].solid.color == PAPER_CLASSES.colors[3]
     assert nodes.objects[3].name.text.startswith("chair 0.")
     assert nodes.frames[1].image.shape == (48, 64, 3)
     np.testing.assert_allclose(nodes.frames[0].position, [3.5, 0.0, 1.6], atol=1e-6)
@@ -155,9 +155,9 @@ def test_what_a_voxel_read_is_drawn_on_the_frames(server, nodes, scene):
 def test_a_chosen_object_and_frame_stand_out(nodes):
     nodes.mark_object(2)
     assert nodes.objects[2].edges.colors.tolist() == [0, 0, 0]
-    assert nodes.objects[1].edges.colors.tolist() == list(CLASS_COLORS[1])
+    assert nodes.objects[1].edges.colors.tolist() == list(PAPER_CLASSES.colors[1])
     nodes.mark_object(None)
-    assert nodes.objects[2].front.colors.tolist() == list(CLASS_COLORS[2])
+    assert nodes.objects[2].front.colors.tolist() == list(PAPER_CLASSES.colors[2])
     nodes.mark_frame(4)
     assert [nodes.frames[n].color == (255, 176, 0) for n in range(5)] == [False] * 4 + [True]
 

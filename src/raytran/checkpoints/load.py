@@ -13,7 +13,8 @@ import torch
 from raytran.checkpoints.file import PREFIX, checkpoint_path, read_checkpoint
 from raytran.checkpoints.metadata import input_mask
 from raytran.checkpoints.network import build_network
-from raytran.errors import CheckpointError, DataError
+from raytran.classes import Classes
+from raytran.errors import CheckpointError, ConfigError, DataError
 from raytran.limits import MAX_VIEWS, SIDE, as_count, as_numbers
 from raytran.model import RayTran
 from raytran.ops.traverse import Attention, RayTracer
@@ -131,13 +132,13 @@ def load_weights(
         CheckpointError: names or shapes differ, or a weight is not finite.
     """
     kept = tuple(f"{part}." for part in fresh)
-    state = {name: value for name, value in _state(checkpoint).items() if not name.startswith(kept)}
+    state = {name: value for name, value in _state(checkpoint).items() if not f"{name}.".startswith(kept)}
     for name, value in state.items():
         if value.is_floating_point() and not _in_float32(value).isfinite().all():
             raise CheckpointError(
                 f"{PREFIX}{name} in {path} is not finite: take a checkpoint from before the training diverged"
             )
-    state |= {name: value for name, value in model.state_dict().items() if name.startswith(kept)}
+    state |= {name: value for name, value in model.state_dict().items() if f"{name}.".startswith(kept)}
     try:
         model.load_state_dict(state, assign=assign)
     except RuntimeError as error:
@@ -153,17 +154,38 @@ def _in_float32(value: torch.Tensor) -> torch.Tensor:
     return value if value.dtype in (torch.float32, torch.float16, torch.bfloat16) else value.float()
 
 
+def classes_of(checkpoint: Mapping[str, Any]) -> Classes:
+    """Return the classes of a checkpoint's network; one that says nothing of them has the paper's nine.
+
+    Args:
+        checkpoint: what ``read_checkpoint`` returned.
+
+    Raises:
+        CheckpointError: what it says of them cannot be.
+    """
+    try:
+        return Classes.of(checkpoint["model"].get("classes"))
+    except ConfigError as error:
+        raise CheckpointError(
+            f"the checkpoint says odd things of its classes ({error}): do not use this file"
+        ) from error
+
+
 def fresh_parts(model: RayTran, checkpoint: Mapping[str, Any], may_be_missing: Sequence[str]) -> list[str]:
     """Return the parts of ``model`` that a stage starts at random although it has a parent.
 
     Those are, first, the parts in ``may_be_missing`` of which the checkpoint has nothing. Second, heads of
     another form than the checkpoint's, if the checkpoint's were never trained: it has no parent, and its
-    stage did not train them. So one stage 1 serves all object heads.
+    stage did not train them. So one stage 1 serves all object heads. Third, what tells classes apart, if the
+    checkpoint has others.
 
     Args:
         model: the network.
         checkpoint: what ``read_checkpoint`` returned.
         may_be_missing: parts that the checkpoint need not have.
+
+    Raises:
+        CheckpointError: see ``classes_of``.
     """
     state = {name: value.shape for name, value in _state(checkpoint).items()}
     wanted = {name: value.shape for name, value in model.state_dict().items()}
@@ -174,7 +196,11 @@ def fresh_parts(model: RayTran, checkpoint: Mapping[str, Any], may_be_missing: S
     missing = [part for part in may_be_missing if not within(part, state)]
     heads = [f"heads.{head}" for head in model.heads]
     other = [head for head in heads if within(head, state) not in ({}, within(head, wanted))]
-    return missing + [head for head in other if _is_random(head, checkpoint)]
+    fresh = missing + [head for head in other if _is_random(head, checkpoint)]
+    if model.classes.names == classes_of(checkpoint).names:
+        return fresh
+    within_fresh = tuple(f"{part}." for part in fresh)
+    return fresh + [layer for layer in model.class_layers() if not layer.startswith(within_fresh)]
 
 
 def _is_random(part: str, checkpoint: Mapping[str, Any]) -> bool:

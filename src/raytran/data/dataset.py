@@ -13,13 +13,21 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
+from raytran.classes import Classes
 from raytran.data.augment import Augmentation
 from raytran.data.cache import MaskCache
 from raytran.data.images import MIN_VIEWS
 from raytran.data.scan import scan_views
-from raytran.data.scan2cad import SceneAnnotation, annotation_path, read_annotations, scene_objects
+from raytran.data.scan2cad import SceneAnnotation, annotation_path, read_annotations
 from raytran.data.scannet.scan import Scan
-from raytran.data.scene_list import ObjectTable, RecentScans, annotated, choose_scenes, read_split
+from raytran.data.scene_list import (
+    ObjectTable,
+    RecentScans,
+    annotated,
+    annotated_objects,
+    choose_scenes,
+    read_split,
+)
 from raytran.data.targets import (
     foreground_masks,
     scene_occupancy,
@@ -94,10 +102,13 @@ class SceneDataset(Dataset[SceneBatch]):
         min_views: fewest different frames of a scene.
         augmentation: random changes of each scene, for training; None for none.
         seed: of the random frames and of the augmentation.
+        classes: of the objects, or their settings, see ``Classes.of``; None: the paper's nine. Annotated
+            objects of no class are left out of all targets, as if they were not annotated.
 
     Raises:
-        ConfigError: unknown targets, a target whose files are not given, or a number that cannot be.
-        DataError: a file or scan is missing, or no scene has objects.
+        ConfigError: unknown targets, a target whose files are not given, a number that cannot be, or classes
+            that are none.
+        DataError: a file or scan is missing, no scene has objects, or none of them has a class.
     """
 
     def __init__(
@@ -120,6 +131,7 @@ class SceneDataset(Dataset[SceneBatch]):
         min_views: int = MIN_VIEWS,
         augmentation: Augmentation | None = None,
         seed: int = 0,
+        classes: Classes | Mapping[str, Any] | None = None,
     ) -> None:
         _check(targets, annotations, shapenet_root, input_mask=input_mask, object_choice=object_choice)
         check_settings({"image_size": image_size, "num_views": num_views, "num_new_views": num_new_views})
@@ -130,7 +142,8 @@ class SceneDataset(Dataset[SceneBatch]):
             annotations = read_annotations(Path(annotations))
         self.scene_ids = choose_scenes(Path(scans_root), scene_ids, annotations)
         self._scans = RecentScans(Path(scans_root), _MAX_SCAN_BYTES)
-        self._objects_of = ObjectTable([_objects_in(annotations, scene_id) for scene_id in self.scene_ids])
+        self.classes = Classes.of(classes)
+        self._objects_of = ObjectTable(annotated_objects(annotations, self.scene_ids, self.classes))
         self._shapenet_root = None if shapenet_root is None else Path(shapenet_root)
         self._cache = MaskCache(folder=Path(cache_dir))
         self._image_size = (int(image_size[0]), int(image_size[1]))
@@ -175,7 +188,7 @@ class SceneDataset(Dataset[SceneBatch]):
             scene = self._augmentation(scene, randomness.generator(_AUGMENTATION))
         if rendered:
             scene = _hold_out_views(scene, seen, rendered)
-        (objects,) = scene.objects or (ObjectSet.empty(),)
+        (objects,) = scene.objects or (ObjectSet.empty(self.classes),)
         targets = None
         if self._targets & {"objects", "shapes"}:
             targets = (self._target_objects(objects, is_seen, scene.grid_center),)
@@ -382,9 +395,3 @@ def _hold_out_views(scene: SceneBatch, seen: Sequence[int], rendered: Sequence[i
         frame_id=tuple(tuple(names[position] for position in seen) for names in scene.frame_id),
         foreground=None if scene.foreground is None else scene.foreground[:, list(seen)],
     )
-
-
-def _objects_in(annotations: Mapping[str, SceneAnnotation] | None, scene_id: str) -> ObjectSet:
-    if annotations is None or scene_id not in annotations:
-        return ObjectSet.empty()
-    return scene_objects(annotations[scene_id])

@@ -12,12 +12,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from raytran.classes import PAPER_CLASSES, Classes
 from raytran.data.cache import file_digest
 from raytran.data.text import as_name, read_json
 from raytran.errors import DataError
 from raytran.geometry.rotation import matrix_from_quaternion, quaternion_from_matrix
 from raytran.limits import BOX_SIDE, CAD_SCALE, HALF_EXTENT, POSITION, QUATERNION, Quantity, as_numbers, shown
-from raytran.structs import CLASS_BY_CATID, CLASSES, SYMMETRY_INFINITE, CadAlignments, ObjectSet
+from raytran.structs import SYMMETRY_INFINITE, CadAlignments, ObjectSet
 
 _log = logging.getLogger(__name__)
 
@@ -128,7 +129,7 @@ def parse_entry(entry: Any) -> SceneAnnotation:
         raise DataError("the scan's trs cannot be inverted") from error
 
 
-def scene_objects(annotation: SceneAnnotation) -> ObjectSet:
+def scene_objects(annotation: SceneAnnotation, classes: Classes = PAPER_CLASSES) -> ObjectSet:
     """Return a scene's objects in the scan frame, the world of the scan's poses.
 
     With M = inv(M_scan) · T R S the centre is M · (box centre), the size the box times the lengths of M's
@@ -136,6 +137,8 @@ def scene_objects(annotation: SceneAnnotation) -> ObjectSet:
 
     Args:
         annotation: one scene of ``read_annotations``.
+        classes: that the models are of, by their category (``Classes.label_of``); those of no class are left
+            out.
 
     Returns:
         M objects without shapes.
@@ -145,16 +148,18 @@ def scene_objects(annotation: SceneAnnotation) -> ObjectSet:
     keep = (scale >= SMALLEST_SCALE).all(dim=1)
     if not keep.all():
         _log.warning("%s: skipped %d models with a degenerate scale", annotation.scene_id, int((~keep).sum()))
-    classes = [CLASS_BY_CATID.get(name.split("/")[0], "other") for name in annotation.model_id]
+    labels = [classes.label_of(name.split("/")[0]) for name in annotation.model_id]
+    keep &= torch.tensor([label is not None for label in labels], dtype=torch.bool)
     center = pose[:, :3, :3] @ annotation.box_center[..., None] + pose[:, :3, 3:]
     return ObjectSet(
-        label=torch.tensor([CLASSES.index(name) for name in classes], dtype=torch.int64),
+        label=torch.tensor([-1 if label is None else label for label in labels], dtype=torch.int64),
         center=center[..., 0].float(),
         size=(2 * annotation.box_half_size * scale).clamp(min=_MIN_SIZE).float(),
         rotation=(pose[:, :3, :3] / scale[:, None]).float(),
         symmetry=annotation.symmetry,
         score=torch.ones(len(pose)),
         model_id=annotation.model_id,
+        classes=classes,
     ).select(keep)
 
 

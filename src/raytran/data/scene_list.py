@@ -3,19 +3,27 @@
 
 from __future__ import annotations
 
+import logging
 import pickle
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Mapping, Sequence
 from itertools import accumulate
 from pathlib import Path
 
 import torch
 
-from raytran.data.scan2cad import SceneAnnotation
+from raytran.classes import Classes
+from raytran.data.scan2cad import SceneAnnotation, scene_objects
 from raytran.data.scannet.scan import Scan, read_scan
 from raytran.data.text import read_names
 from raytran.errors import DataError
+from raytran.limits import shown
 from raytran.structs import ObjectSet
+
+_log = logging.getLogger(__name__)
+
+_SHOWN = 5
+"""Categories that are named of those that belong to no class."""
 
 
 def choose_scenes(
@@ -67,6 +75,41 @@ def read_split(scannet: Path, split: str) -> list[str] | None:
     if any(scannet.glob("scannetv2_*.txt")):
         raise DataError(f"there is no {path}: choose a split that has a file, or write its scans there")
     return None
+
+
+def annotated_objects(
+    annotations: Mapping[str, SceneAnnotation] | None, scene_ids: Sequence[str], classes: Classes
+) -> list[ObjectSet]:
+    """Return the objects of each scene; those of no class are left out, and counted in the log.
+
+    Args:
+        annotations: of the scenes; None if there are none at all.
+        scene_ids: the scenes; those without annotation have no objects.
+        classes: of the objects.
+
+    Raises:
+        DataError: there are objects, and all of them are of no class.
+    """
+    found = {} if annotations is None else annotations
+    scenes = [found.get(scene_id) for scene_id in scene_ids]
+    categories = Counter(
+        name.split("/")[0] for scene in scenes if scene is not None for name in scene.model_id
+    )
+    unknown = {
+        category: count for category, count in categories.items() if classes.label_of(category) is None
+    }
+    if unknown:
+        few = ", ".join(map(shown, list(unknown)[:_SHOWN])) + (", …" if len(unknown) > _SHOWN else "")
+        if len(unknown) == len(categories):
+            raise DataError(
+                f"none of the {categories.total()} annotated objects, of categories {few}, is of one of the "
+                f"classes ({classes}): name those of the data in classes.names or classes.catids"
+            )
+        _log.warning(
+            "%d of %d annotated objects belong to no class and are left out, of categories %s",
+            *(sum(unknown.values()), categories.total(), few),
+        )
+    return [ObjectSet.empty(classes) if scene is None else scene_objects(scene, classes) for scene in scenes]
 
 
 class ObjectTable:

@@ -13,8 +13,9 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from raytran.classes import Classes
 from raytran.geometry.camera import Cameras
-from raytran.structs import CLASS_COLORS, CLASSES, ObjectSet
+from raytran.structs import ObjectSet
 
 ROOT = "scene_y_up"
 """Node above all others, which leaves them where they are."""
@@ -40,7 +41,7 @@ def turned_y_up(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 def object_name(objects: ObjectSet, index: int) -> str:
     """Return what an object is called in every file, e.g. ``00_chair``."""
-    return f"{index:02d}_{CLASSES[int(objects.label[index])]}"
+    return f"{index:02d}_{objects.classes.names[int(objects.label[index])]}"
 
 
 def write_glb(
@@ -73,12 +74,12 @@ def write_glb(
     for i, mesh in enumerate(meshes):
         label, name = int(objects.label[i]), object_name(objects, i)
         if mesh is not None:
-            _add(scene, name, mesh, label)
-        _add(scene, f"{name}_box", _box_edges(objects, i), label)
+            _add(scene, name, mesh, objects.classes, label)
+        _add(scene, f"{name}_box", _box_edges(objects, i), objects.classes, label)
 
     def complete(tree: dict[str, Any]) -> None:
         for material in tree.get("materials", ()):
-            color = _linear(CLASS_COLORS[CLASSES.index(material["name"])])
+            color = _linear(objects.classes.colors[objects.classes.index(material["name"])])
             material["pbrMetallicRoughness"]["baseColorFactor"] = [*color, 1.0]
         if cameras is not None:
             _add_cameras(tree, cameras, frame_ids)
@@ -95,12 +96,12 @@ def _linear(color: Sequence[int]) -> list[float]:
     return [value / 12.92 if value <= 0.04045 else ((value + 0.055) / 1.055) ** 2.4 for value in values]
 
 
-def _add(scene: trimesh.Scene, name: str, mesh: trimesh.Trimesh, label: int) -> None:
+def _add(scene: trimesh.Scene, name: str, mesh: trimesh.Trimesh, classes: Classes, label: int) -> None:
     solid = turned_y_up(mesh)
     # Its colour is set in the finished file: trimesh rounds colours to 256 steps, too few for linear light.
     material = trimesh.visual.material.PBRMaterial(
-        name=CLASSES[label],
-        baseColorFactor=[*CLASS_COLORS[label], 255],
+        name=classes.names[label],
+        baseColorFactor=[*classes.colors[label], 255],
         metallicFactor=0.0,
         roughnessFactor=0.8,
         doubleSided=True,

@@ -16,13 +16,14 @@ import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
+from raytran.classes import Classes
 from raytran.data.shapenet.models import categories, model_names, read_facts, read_mesh, shapenet_version
 from raytran.data.shapenet.voxelize import voxelize_solid
 from raytran.data.targets import cad_meshes
 from raytran.data.workers import work_on
 from raytran.errors import DataError
 from raytran.export.cad_alignments import align_cads
-from raytran.structs import CLASS_BY_CATID, CLASSES, SHAPE_SIZE, CadAlignments, ObjectSet
+from raytran.structs import SHAPE_SIZE, CadAlignments, ObjectSet
 
 _log = logging.getLogger(__name__)
 
@@ -99,10 +100,10 @@ def nearest_cads(objects: ObjectSet, root: Path, *, processes: int = 0, progress
     left_out: dict[str, str] = {}
     for label in sorted(set(objects.label.tolist())):
         index = (objects.label == label).nonzero().squeeze(1)
-        models, extents = _models_of_class(root, label, left_out)
+        models, extents = _models_of_class(root, objects.classes, label, left_out)
         search = partial(
             work_on,
-            label=f"CAD models: {CLASSES[label]}",
+            label=f"CAD models: {objects.classes.names[label]}",
             processes=processes,
             items_each=_MODELS_PER_PROCESS,
             progress=progress,
@@ -138,11 +139,13 @@ class _Cells(NamedTuple):
     reason: str
 
 
-def _models_of_class(root: Path, label: int, left_out: dict[str, str]) -> tuple[list[str], Floats]:
+def _models_of_class(
+    root: Path, classes: Classes, label: int, left_out: dict[str, str]
+) -> tuple[list[str], Floats]:
     """Return the ``catid/id`` of a class's models and their extents ``(C, 3)``, in any unit."""
     names, extents = [], []
     for catid in categories(root):
-        if CLASS_BY_CATID.get(catid, "other") != CLASSES[label]:
+        if classes.label_of(catid) != label:
             continue
         for name in model_names(root, catid):
             try:
@@ -237,13 +240,7 @@ def _box_iou(first: Floats, second: Floats) -> Floats:
 
 def _report(objects: ObjectSet, choices: Sequence[_Choice], root: Path, left_out: dict[str, str]) -> None:
     """Say for how many objects there is a model, and what was left out."""
-    none = sorted(
-        {
-            CLASSES[label]
-            for label, choice in zip(objects.label.tolist(), choices, strict=True)
-            if not choice.name
-        }
-    )
+    none = sorted({name for name, choice in zip(objects.category, choices, strict=True) if not choice.name})
     missing = f"; {root} has no CAD model of class {', '.join(none)}" if none else ""
     num_found = sum(bool(choice.name) for choice in choices)
     _log.info("nearest CAD models: for %d of %d objects%s", num_found, len(choices), missing)

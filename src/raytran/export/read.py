@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from raytran.classes import PAPER_CLASSES, Classes
 from raytran.data.text import as_name, read_json_object, read_text
-from raytran.errors import DataError
+from raytran.errors import ConfigError, DataError
 from raytran.export.cad_alignments import ALIGNMENTS, SCAN2CAD_COLUMNS, align_cads
 from raytran.export.write import FORMAT
 from raytran.geometry.rotation import matrix_from_quaternion
@@ -32,7 +33,7 @@ from raytran.limits import (
     as_numbers,
     shown,
 )
-from raytran.structs import CLASS_BY_CATID, CLASSES, CadAlignments, ObjectSet, ScenePrediction
+from raytran.structs import CadAlignments, ObjectSet, ScenePrediction
 
 _log = logging.getLogger(__name__)
 
@@ -127,7 +128,9 @@ class PredictionFiles:
         }
 
 
-def read_predictions(path: Path, scene_ids: Collection[str], cad_boxes: CadBoxes) -> PredictionFiles:
+def read_predictions(
+    path: Path, scene_ids: Collection[str], cad_boxes: CadBoxes, classes: Classes = PAPER_CLASSES
+) -> PredictionFiles:
     """Read the predictions for the scenes asked for.
 
     Args:
@@ -136,6 +139,7 @@ def read_predictions(path: Path, scene_ids: Collection[str], cad_boxes: CadBoxes
             or a CSV with all scenes, of ROCA's 14 columns, Scan2CAD's 13 or Vid2CAD's 16.
         scene_ids: the annotated scenes; others are ignored, without being opened.
         cad_boxes: of the CAD models that the annotations name.
+        classes: that the objects are of; CAD models of no class have no box of protocol ``strict``.
 
     Raises:
         DataError: nothing there is for any of the scenes, a scene occurs twice, or a file is damaged.
@@ -144,14 +148,16 @@ def read_predictions(path: Path, scene_ids: Collection[str], cad_boxes: CadBoxes
         alignments = _with_known_ids(read_roca_csv(path), scene_ids)
         ignored = tuple(alignments.keys() - set(scene_ids))
         scenes = {
-            name: _from_alignments(path, alignments[name], cad_boxes)
+            name: _from_alignments(path, alignments[name], cad_boxes, classes)
             for name in alignments
             if name in scene_ids
         }
     else:
         files = _files_by_scene(path)
         ignored = tuple(name for name in files if name not in scene_ids)
-        scenes = {name: _read_scene(files[name], name, cad_boxes) for name in files if name in scene_ids}
+        scenes = {
+            name: _read_scene(files[name], name, cad_boxes, classes) for name in files if name in scene_ids
+        }
     if not scenes:
         raise DataError(
             f"{path} holds no predictions for any of the {len(scene_ids)} annotated scenes: name the files "
@@ -204,10 +210,10 @@ def _files_by_scene(folder: Path) -> dict[str, Path]:
     return files
 
 
-def _read_scene(path: Path, scene_id: str, cad_boxes: CadBoxes) -> ScenePredictions:
+def _read_scene(path: Path, scene_id: str, cad_boxes: CadBoxes, classes: Classes) -> ScenePredictions:
     if path.suffix == ".csv":
-        return _from_alignments(path, read_alignments_csv(path), cad_boxes)
-    prediction = read_scene_json(path)
+        return _from_alignments(path, read_alignments_csv(path), cad_boxes, classes)
+    prediction = read_scene_json(path, classes)
     if prediction.scene_id not in (scene_id, ""):
         raise DataError(
             f"{path} says that it is scene {prediction.scene_id!r}, but its name says {scene_id!r}: rename it"
@@ -239,21 +245,26 @@ def _line_of_object(path: Path, index: int) -> int:
     return text.count("\n", 0, starts[index]) + 1 if index < len(starts) else 1
 
 
-def _from_alignments(path: Path, cads: CadAlignments, cad_boxes: CadBoxes) -> ScenePredictions:
+def _from_alignments(
+    path: Path, cads: CadAlignments, cad_boxes: CadBoxes, classes: Classes
+) -> ScenePredictions:
     """Turn CAD alignments into boxes, as far as the CAD models are known."""
     index = torch.tensor([i for i, name in enumerate(cads.model_id) if name in cad_boxes], dtype=torch.int64)
     known = cads.select(index)
     rotation = matrix_from_quaternion(known.quaternion)
     center, half = _lookup(known.model_id, cad_boxes)
+    labels = [classes.label_of(catid) for catid in known.catid]
     objects = ObjectSet(
-        label=torch.tensor([CLASSES.index(name) for name in known.category], dtype=torch.int64),
+        label=torch.tensor([-1 if label is None else label for label in labels], dtype=torch.int64),
         center=known.translation + (rotation @ (known.scale * center)[..., None])[..., 0],
         size=_sizes(2 * half * known.scale, path),
         rotation=rotation,
         symmetry=torch.ones(len(known), dtype=torch.int64),
         score=known.score,
         model_id=known.model_id,
+        classes=classes,
     )
+    objects = objects.select(objects.label >= 0)
     return ScenePredictions(path, objects, cads, cads, n_unknown_cads=len(cads) - len(known))
 
 
@@ -273,10 +284,10 @@ def _from_objects(path: Path, objects: ObjectSet, cad_boxes: CadBoxes) -> SceneP
     names = objects.model_id or ("",) * len(objects)
     known = [name in cad_boxes and bool((cad_boxes[name][1] > 0).all()) for name in names]
     center, half = _lookup([name if ok else "" for name, ok in zip(names, known, strict=True)], cad_boxes)
-    catid_of = {category: catid for catid, category in CLASS_BY_CATID.items()}
+    catid_of = [next(iter(catids), "") for catids in objects.classes.catids]
     split_names = [name.partition("/") for name in names]
     catids = [
-        catid or catid_of.get(CLASSES[label], "")
+        catid or catid_of[label]
         for (catid, _, _), label in zip(split_names, objects.label.tolist(), strict=True)
     ]
     id_cads = [id_cad for _, _, id_cad in split_names]
@@ -297,8 +308,12 @@ def _lookup(names: Collection[str], cad_boxes: CadBoxes) -> tuple[Tensor, Tensor
     return torch.stack([center for center, _ in boxes]), torch.stack([half for _, half in boxes])
 
 
-def read_scene_json(path: Path) -> ScenePrediction:
+def read_scene_json(path: Path, classes: Classes | None = None) -> ScenePrediction:
     """Read what ``write_scene_json`` wrote; the numbers are float64, as written.
+
+    Args:
+        path: the file.
+        classes: that the objects are of; None: those that the file lists, the paper's where it lists none.
 
     Returns:
         The objects, with symmetry 1 and no shapes. The file does not hold the voxel grid, so ``grid_center``
@@ -317,20 +332,25 @@ def read_scene_json(path: Path) -> ScenePrediction:
     entries = content.get("objects")
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise DataError(f"{path} has no list of objects: write it again")
+    if classes is None:
+        try:
+            classes = Classes.of(content.get("classes"))
+        except ConfigError as error:
+            raise DataError(f"{path} lists classes that are none ({error}): write it again") from error
     # One may write an empty name.
     scene_id = content.get("scene_id") and as_name(content["scene_id"], f"scene_id in {path}")
     if not isinstance(scene_id, str):
         raise DataError(f"{path} has no scene_id: write it again")
     prediction = ScenePrediction(
         scene_id=scene_id,
-        objects=_objects_from_json(entries, path),
+        objects=_objects_from_json(entries, classes, path),
         grid_center=torch.full((3,), torch.nan),
     )
     _check_objects(prediction.objects, path)
     return prediction
 
 
-def _objects_from_json(entries: Sequence[dict[str, Any]], path: Path) -> ObjectSet:
+def _objects_from_json(entries: Sequence[dict[str, Any]], classes: Classes, path: Path) -> ObjectSet:
     count = len(entries)
 
     def column(key: str, quantity: Quantity, *shape: int) -> torch.Tensor:
@@ -341,23 +361,22 @@ def _objects_from_json(entries: Sequence[dict[str, Any]], path: Path) -> ObjectS
 
     models = tuple(_model_id(entry, path) for entry in entries)
     return ObjectSet(
-        label=torch.tensor([_label(entry, path) for entry in entries], dtype=torch.int64),
+        label=torch.tensor([_label(entry, classes, path) for entry in entries], dtype=torch.int64),
         center=column("center", POSITION, 3),
         size=column("size", Quantity("a length in metres", -BOX_SIDE.high, BOX_SIDE.high), 3),
         rotation=column("rotation", MATRIX_ENTRY, 3, 3),
         symmetry=torch.ones(count, dtype=torch.int64),
         score=column("score", SCORE),
         model_id=models if any(models) else (),
+        classes=classes,
     )
 
 
-def _label(entry: Mapping[str, Any], path: Path) -> int:
+def _label(entry: Mapping[str, Any], classes: Classes, path: Path) -> int:
     category = entry.get("category")
-    if category not in CLASSES:
-        raise DataError(
-            f"{path} has an object of category {shown(category)}: choose one of {', '.join(CLASSES)}"
-        )
-    return CLASSES.index(category)
+    if category not in classes.names:
+        raise DataError(f"{path} has an object of category {shown(category)}: choose one of {classes}")
+    return classes.index(category)
 
 
 def _model_id(entry: Mapping[str, Any], path: Path) -> str:

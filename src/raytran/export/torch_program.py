@@ -21,12 +21,12 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
 from raytran.checkpoints.file import write_whole
+from raytran.classes import PADDING_NAME
 from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.model import TASKS, RayTran
 from raytran.ops.pairs import PairList
-from raytran.structs import CLASSES
 
 _log = logging.getLogger(__name__)
 
@@ -273,7 +273,7 @@ def _geometry(model: RayTran, image_size: tuple[int, int]) -> dict[str, Any]:
         "rays_per_cell": model.rays_per_cell,
         "grid_resolution": list(model.grid_resolution),
         "grid_extent": list(model.grid_extent),
-        "classes": [*CLASSES, "padding"],
+        "classes": [*model.classes.names, PADDING_NAME],
     }
 
 

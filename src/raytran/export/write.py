@@ -13,13 +13,14 @@ import trimesh
 from matplotlib import colormaps
 from torch import Tensor
 
+from raytran.classes import PAPER_CLASSES, Color
 from raytran.data.files import write_text
 from raytran.errors import ShapeError
 from raytran.export.glb import object_name, turned_y_up, write_glb
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.rotation import yaw_from_rotation
-from raytran.structs import CLASS_COLORS, CLASSES, ObjectSet, ScenePrediction
+from raytran.structs import ObjectSet, ScenePrediction
 
 FORMAT = "raytran.scene/1"
 """Value of ``format``; the number rises when a reader of the old form could misread the new one."""
@@ -92,7 +93,8 @@ def write_scene_json(path: Path, prediction: ScenePrediction, mesh_names: Sequen
     ``center`` and ``rotation`` are in the world of the input poses (+Z up, metres); ``size`` and ``rotation``
     follow the object frame (x width, y height, z depth; +Y up, front -Z); ``yaw`` is in radians. Where views
     were counted, ``num_views`` says how many saw the object's box and ``confidence`` is the score times
-    ``n / (n + 1)`` of that number: what few saw is less certain than its score.
+    ``n / (n + 1)`` of that number: what few saw is less certain than its score. Classes other than the
+    paper's are listed under ``classes``, as ``Classes.settings`` gives them.
 
     Args:
         path: the file; written whole or not at all.
@@ -103,11 +105,11 @@ def write_scene_json(path: Path, prediction: ScenePrediction, mesh_names: Sequen
         ``path``.
     """
     objects = prediction.objects
-    yaw = yaw_from_rotation(objects.rotation.double())
+    yaw, category = yaw_from_rotation(objects.rotation.double()), objects.category
     entries = []
     for i, mesh in enumerate(mesh_names):
         entry: dict[str, Any] = {
-            "category": CLASSES[int(objects.label[i])],
+            "category": category[i],
             "score": float(objects.score[i]),
             "center": objects.center[i].tolist(),
             "size": objects.size[i].tolist(),
@@ -121,7 +123,10 @@ def write_scene_json(path: Path, prediction: ScenePrediction, mesh_names: Sequen
         if objects.model_id and objects.model_id[i]:
             entry["catid_cad"], entry["id_cad"] = objects.model_id[i].split("/", 1)
         entries.append(entry)
-    content = {"format": FORMAT, "scene_id": prediction.scene_id, "up": "+z", "unit": "m", "objects": entries}
+    content: dict[str, Any] = {"format": FORMAT, "scene_id": prediction.scene_id, "up": "+z", "unit": "m"}
+    if objects.classes != PAPER_CLASSES:
+        content["classes"] = objects.classes.settings()
+    content["objects"] = entries
     write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
     return path
 
@@ -148,27 +153,29 @@ def write_meshes(
             names.append(None)
             continue
         names.append(f"meshes/{i:02d}.ply")
-        _painted(mesh, int(objects.label[i])).export(folder / f"meshes/{i:02d}.ply")
-        _write_obj(folder / f"meshes/{i:02d}.obj", object_name(objects, i), mesh, int(objects.label[i]))
+        label = int(objects.label[i])
+        name, color = objects.classes.names[label], objects.classes.colors[label]
+        _painted(mesh, color).export(folder / f"meshes/{i:02d}.ply")
+        _write_obj(folder / f"meshes/{i:02d}.obj", object_name(objects, i), mesh, material=name, color=color)
     return names
 
 
-def _painted(mesh: trimesh.Trimesh, label: int) -> trimesh.Trimesh:
+def _painted(mesh: trimesh.Trimesh, color: Color) -> trimesh.Trimesh:
     painted = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    painted.visual = trimesh.visual.ColorVisuals(painted, vertex_colors=[*CLASS_COLORS[label], 255])
+    painted.visual = trimesh.visual.ColorVisuals(painted, vertex_colors=[*color, 255])
     return painted
 
 
-def _write_obj(path: Path, name: str, mesh: trimesh.Trimesh, label: int) -> None:
+def _write_obj(path: Path, name: str, mesh: trimesh.Trimesh, *, material: str, color: Color) -> None:
     solid = turned_y_up(mesh)
     solid.metadata["name"] = name
-    material = trimesh.visual.material.SimpleMaterial(
-        name=CLASSES[label],
-        diffuse=[*CLASS_COLORS[label], 255],
+    surface = trimesh.visual.material.SimpleMaterial(
+        name=material,
+        diffuse=[*color, 255],
         ambient=[0, 0, 0, 255],
         specular=[0, 0, 0, 255],
     )
-    solid.visual = trimesh.visual.TextureVisuals(material=material)
+    solid.visual = trimesh.visual.TextureVisuals(material=surface)
     library = path.with_suffix(".mtl")
     text, files = trimesh.exchange.obj.export_obj(
         solid,
@@ -178,7 +185,7 @@ def _write_obj(path: Path, name: str, mesh: trimesh.Trimesh, label: int) -> None
         mtl_name=library.name,
         header=None,
     )
-    path.write_text(text.lstrip("\n"), encoding="ascii")
+    path.write_text(text.lstrip("\n"), encoding="utf-8")
     library.write_bytes(files[library.name] + b"\n")
 
 

@@ -20,7 +20,7 @@ from raytran.geometry.rotation import yaw_from_rotation
 from raytran.heads.objects import QUERY_SCALE, ObjectHead, ObjectOutputs, Queries
 from raytran.losses.objects import Betas, Differences, Match, TrueObjects, object_losses
 from raytran.losses.total import ExtensionLoss
-from raytran.structs import CLASSES, ObjectSet, RawObjects, RawScene, sent_to
+from raytran.structs import ObjectSet, RawObjects, RawScene, sent_to
 
 CENTER_NOISE = 0.5
 """Largest shift of a centre, as a multiple of the object's size along each of its axes: it stays inside."""
@@ -50,7 +50,9 @@ class DenoisingObjectHead(ObjectHead):
         if num_copies < 1:
             raise ConfigError(f"num_copies must be 1 or more, got {num_copies}")
         # Made last, so that the other parts start from the same weights with and without it.
-        self.denoising_queries = NoisyCopies(channels=self.position.in_features, num_copies=num_copies)
+        self.denoising_queries = NoisyCopies(
+            channels=self.position.in_features, num_copies=num_copies, num_classes=self.num_classes
+        )
 
     def forward(
         self, voxels: Tensor, grid: VoxelGrid, true_objects: Sequence[ObjectSet] | None = None
@@ -86,12 +88,15 @@ class NoisyCopies(nn.Module):
     Args:
         channels: C.
         num_copies: D of each scene; if it has more objects the last ones get none.
+        num_classes: K.
     """
 
-    def __init__(self, *, channels: int, num_copies: int) -> None:
+    class_layers = ("embedding",)
+
+    def __init__(self, *, channels: int, num_copies: int, num_classes: int) -> None:
         super().__init__()
         self.num_copies = num_copies
-        self.embedding = nn.Parameter(QUERY_SCALE * torch.randn(len(CLASSES), channels))
+        self.embedding = nn.Parameter(QUERY_SCALE * torch.randn(num_classes, channels))
 
     @torch.compiler.disable
     def forward(self, true_objects: Sequence[ObjectSet], start: Queries, grid: VoxelGrid) -> Queries:
@@ -111,7 +116,7 @@ class NoisyCopies(nn.Module):
         shape = label.shape
         told = torch.where(
             torch.rand(shape, device=label.device) < WRONG_CLASS,
-            torch.randint(len(CLASSES), shape, device=label.device),
+            torch.randint(len(self.embedding), shape, device=label.device),
             label,
         )
         if start.proposals is None:

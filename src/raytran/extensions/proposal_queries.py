@@ -8,18 +8,19 @@ become the decoder's queries. So few scenes suffice: what one voxel learns holds
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 from typing import cast
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from raytran.classes import PAPER_CLASSES
 from raytran.geometry.grid import VoxelGrid
 from raytran.heads.objects import TYPICAL_SIZE, Queries
 from raytran.losses.objects import Betas, Differences, TrueObjects, pose_errors
 from raytran.losses.total import ExtensionLoss
-from raytran.structs import CLASSES, ObjectSet, RawProposals, RawScene
+from raytran.structs import ObjectSet, RawProposals, RawScene
 
 RARE = 0.01
 """Probability of an object's centre in a voxel before training (focal loss, Lin et al., ICCV 2017)."""
@@ -42,16 +43,19 @@ class ProposalQueries(nn.Module):
     Args:
         channels: C.
         num_queries: Q; may be changed after training, no parameter depends on it.
+        classes: K classes, or their names.
     """
 
-    def __init__(self, *, channels: int, num_queries: int) -> None:
+    class_layers = ("category", "likely_class")
+
+    def __init__(self, *, channels: int, num_queries: int, classes: Sized = PAPER_CLASSES) -> None:
         super().__init__()
         self.num_queries = num_queries
         self.convolution = nn.Conv3d(channels, channels, 3, padding=1)
         self.norm = nn.LayerNorm(channels)
-        self.category = nn.Linear(channels, len(CLASSES))
+        self.category = nn.Linear(channels, len(classes))
         self.pose = nn.Linear(channels, 3 + 3 + 2)
-        self.likely_class = nn.Linear(len(CLASSES), channels)
+        self.likely_class = nn.Linear(len(classes), channels)
         nn.init.normal_(self.pose.weight, std=0.01)
         with torch.no_grad():
             self.category.bias.fill_(-math.log(1 / RARE - 1))

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Sequence, Sized
 from typing import Any, NamedTuple, cast
 
 import torch
@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.quasirandom import SobolEngine
 
+from raytran.classes import PAPER_CLASSES, Classes
 from raytran.errors import ConfigError
 from raytran.geometry.grid import VoxelGrid, centered_voxels, position_code, voxel_code
 from raytran.geometry.rotation import rotation_from_yaw
@@ -23,7 +24,7 @@ from raytran.heads.decoder import (
     keys_and_values_together,
 )
 from raytran.norms import LayerNorm
-from raytran.structs import CLASSES, PADDING, ObjectSet, RawObjects, RawProposals
+from raytran.structs import ObjectSet, RawObjects, RawProposals
 
 QUERY_SCALE = 0.1
 """Standard deviation of the query embeddings before training: small, so that what they read outweighs it."""
@@ -116,6 +117,7 @@ class ObjectHead(nn.Module):
         voxel_attention: what queries read the voxels with, see ``DecoderLayer``.
         refinement: from what a layer started from and what it predicts to what the next one starts from; None
             for ``CenterRefinement``.
+        classes: K classes, or their names; each layer's output has padding behind them.
 
     Raises:
         ConfigError: queries are named by a word.
@@ -135,6 +137,7 @@ class ObjectHead(nn.Module):
         queries: Callable[..., nn.Module] | None = None,
         voxel_attention: Callable[..., nn.Module] | None = None,
         refinement: nn.Module | None = None,
+        classes: Sized = PAPER_CLASSES,
     ) -> None:
         super().__init__()
         if isinstance(queries, str):
@@ -144,6 +147,7 @@ class ObjectHead(nn.Module):
                 "or model.heads.objects.queries=null for learned ones"
             )
         self.grid_extent = tuple(float(length) for length in grid_extent)
+        self.num_classes = len(classes)
         self.register_buffer("extent", torch.tensor(self.grid_extent), persistent=False)
         self.queries = (
             LearnedQueries(channels=channels, num_queries=num_queries, extent=self.grid_extent)
@@ -157,7 +161,9 @@ class ObjectHead(nn.Module):
             )
             for _ in range(num_layers)
         )
-        self.predictors = nn.ModuleList(ObjectPredictor(channels=channels) for _ in range(num_layers))
+        self.predictors = nn.ModuleList(
+            ObjectPredictor(channels=channels, num_classes=self.num_classes) for _ in range(num_layers)
+        )
         self.refinement = CenterRefinement() if refinement is None else refinement
 
     def forward(
@@ -255,12 +261,15 @@ class ObjectPredictor(nn.Module):
 
     Args:
         channels: C of the queries.
+        num_classes: K.
     """
 
-    def __init__(self, *, channels: int) -> None:
+    class_layers = ("category",)
+
+    def __init__(self, *, channels: int, num_classes: int) -> None:
         super().__init__()
         self.norm = LayerNorm(channels)
-        self.category = nn.Linear(channels, len(CLASSES) + 1)
+        self.category = nn.Linear(channels, num_classes + 1)
         self.offset = _perceptron(channels, 3)
         self.log_size = _perceptron(channels, 3)
         self.yaw = _perceptron(channels, 2)
@@ -328,7 +337,7 @@ def _perceptron(channels: int, outputs: int) -> nn.Sequential:
 
 
 def objects_of_queries(
-    raw: RawObjects, scene: int, *, score_threshold: float = 0.0
+    raw: RawObjects, scene: int, *, score_threshold: float = 0.0, classes: Classes = PAPER_CLASSES
 ) -> tuple[ObjectSet, Tensor]:
     """Return one scene's objects, highest score first, and their embeddings.
 
@@ -336,11 +345,12 @@ def objects_of_queries(
         raw: one decoder layer's output for B scenes.
         scene: which of them.
         score_threshold: queries whose best class has a lower probability are left out.
+        classes: what the network's K outputs before padding stand for.
 
     Returns:
         M objects without shapes, and ``(M, C)`` embeddings.
     """
-    probability = raw.class_logits[scene].softmax(dim=-1)[:, :PADDING]
+    probability = raw.class_logits[scene].softmax(dim=-1)[:, :-1]
     score, label = probability.max(dim=-1)
     order = score.argsort(descending=True, stable=True)
     order = order[score[order] >= score_threshold]
@@ -352,5 +362,6 @@ def objects_of_queries(
         rotation=rotation_from_yaw(torch.atan2(sin, cos)),
         symmetry=torch.ones_like(label[order]),
         score=score[order],
+        classes=classes,
     )
     return objects, raw.embedding[scene, order]

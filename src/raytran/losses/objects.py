@@ -12,7 +12,7 @@ from torch import Tensor
 
 from raytran.errors import ConfigError
 from raytran.geometry.rotation import symmetric_yaw_error, yaw_from_rotation
-from raytran.structs import PADDING, ObjectSet, RawObjects, constant
+from raytran.structs import ObjectSet, RawObjects, constant
 
 
 class Match(NamedTuple):
@@ -191,9 +191,10 @@ def object_losses(
         ``class``, ``center``, ``size`` and ``yaw`` of each layer, ``(L,)``; zero pose losses without objects.
     """
     logits = layers.class_logits.float().flatten(1, 2)
-    label = torch.full(logits.shape[:2], PADDING, device=logits.device)
+    padding = logits.shape[-1] - 1
+    label = torch.full(logits.shape[:2], padding, device=logits.device)
     label.scatter_(1, match.query, targets.label[match.target])
-    weights = constant((*[1.0] * PADDING, no_object_weight), logits.dtype, device=logits.device)
+    weights = constant((*[1.0] * padding, no_object_weight), logits.dtype, device=logits.device)
     entropy = F.cross_entropy(logits.flatten(0, 1), label.flatten(), weights, reduction="none")
     losses = {"class": entropy.view(label.shape).sum(dim=-1) / class_weight}
     errors = pose_errors(differences.of_pairs(match), betas)

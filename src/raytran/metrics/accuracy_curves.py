@@ -15,7 +15,7 @@ from torch import Tensor
 from raytran.metrics.functional.alignment import SCAN2CAD_LIMITS, alignment_errors, row_blocks
 from raytran.metrics.functional.detection import score_order
 from raytran.metrics.per_scene import ObjectMetric, Row, SceneRecord
-from raytran.structs import CLASSES, ObjectSet
+from raytran.structs import ObjectSet
 
 FACTORS: tuple[float, ...] = tuple(round(0.1 * step, 1) for step in range(1, 31))
 """Multiples of ``SCAN2CAD_LIMITS`` at which the curves are sampled: 2 cm … 60 cm, 2° … 60°, 2 % … 60 %."""
@@ -53,6 +53,9 @@ class AccuracyCurves(ObjectMetric):
 
     Three curves vary one threshold and leave the other two errors out of account; the fourth scales the three
     limits of the benchmark together, so that at 1 it is ``Scan2CADAccuracy``.
+
+    Args:
+        **kwargs: see ``ObjectMetric``.
     """
 
     # An object: label, then whether it is found at each point of each curve.
@@ -78,7 +81,7 @@ class AccuracyCurves(ObjectMetric):
     def compute(self) -> dict[str, CurveResult]:
         """Return each curve by name."""
         truths = self.truths()
-        one_hot = torch.nn.functional.one_hot(truths[:, 0].long(), len(CLASSES)).double()
+        one_hot = torch.nn.functional.one_hot(truths[:, 0].long(), len(self.classes)).double()
         total = one_hot.sum(dim=0)
         good = truths[:, 1:].T @ one_hot
         by_class = (good / total.clamp(min=1))[:, total > 0]
@@ -101,7 +104,11 @@ class AccuracyCurves(ObjectMetric):
         rows: list[Row] = []
         for index, (label, found) in enumerate(zip(record.truths[:, 0].tolist(), joint, strict=True)):
             first = FACTORS[int(found.long().argmax())] if found.any() else None
-            row: Row = {"scene_id": record.scene_id, "object": index, "category": CLASSES[int(label)]}
+            row: Row = {
+                "scene_id": record.scene_id,
+                "object": index,
+                "category": self.classes.names[int(label)],
+            }
             rows.append(row | {"found_from": first})
         return rows
 

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import bootstrap, permutation_test
 
+from raytran.classes import PAPER_CLASSES
 from raytran.metrics.per_scene import Row
-from raytran.structs import CLASSES
 
 Counts = NDArray[np.float64]
 
@@ -54,7 +54,9 @@ class Comparison(TypedDict):
     n_scenes: int
 
 
-def class_counts(rows: Iterable[Row], scene_ids: Sequence[str], classes: Sequence[str] = CLASSES) -> Counts:
+def class_counts(
+    rows: Iterable[Row], scene_ids: Sequence[str], classes: Sequence[str] = PAPER_CLASSES.names
+) -> Counts:
     """Return found and annotated objects of each class in each scene.
 
     Args:

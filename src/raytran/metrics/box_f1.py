@@ -9,6 +9,7 @@ from typing import Any, TypedDict
 import torch
 from torch import Tensor
 
+from raytran.classes import PAPER_CLASSES
 from raytran.errors import ConfigError
 from raytran.geometry.boxes import OrientedBoxes, box_iou
 from raytran.metrics.functional.cad_errors import cad_half_extents
@@ -23,7 +24,7 @@ from raytran.metrics.functional.detection import (
 )
 from raytran.metrics.functional.odam import bev_iou, odam_predicted_boxes, odam_true_boxes
 from raytran.metrics.per_scene import ProtocolMetric, Row, SceneRecord
-from raytran.structs import CLASSES, CadAlignments, ObjectSet
+from raytran.structs import CadAlignments, ObjectSet
 
 BOX_F1_PROTOCOLS: tuple[str, ...] = ("strict", "odam")
 
@@ -51,7 +52,7 @@ class BoxF1Result(TypedDict):
 class OrientedBoxF1(ProtocolMetric):
     """Precision, recall and F1 of predicted boxes, pooled over all classes and scenes.
 
-    Protocol ``strict``, which compares ``ObjectSet``s: exact IoU of the oriented boxes; all nine classes,
+    Protocol ``strict``, which compares ``ObjectSet``s: exact IoU of the oriented boxes; all classes,
     matched by name; predictions choose in the order of their scores, and each takes the free object of
     highest IoU if that is *above* the threshold, so that matching is one to one; every scene counts. All
     predictions given count; ``best`` tells what is reached when those below one score, chosen to maximise F1,
@@ -68,7 +69,7 @@ class OrientedBoxF1(ProtocolMetric):
         cad_half_extents: of each ``catid/id``, for ``odam``, the boxes of predictions that do not bring their
             own (``functional.cad_errors.cad_half_extents``). None: those of each scene's own annotation.
         iou_thresholds: IoUs that a match must exceed.
-        **kwargs: see ``torchmetrics.Metric``.
+        **kwargs: see ``ObjectMetric``.
 
     Raises:
         ConfigError: the protocol is unknown, or there is no threshold.
@@ -82,13 +83,12 @@ class OrientedBoxF1(ProtocolMetric):
         iou_thresholds: Sequence[float] = (0.25, 0.5),
         **kwargs: Any,
     ) -> None:
-        super().__init__(**kwargs)
         if protocol not in BOX_F1_PROTOCOLS:
             known = ", ".join(BOX_F1_PROTOCOLS)
             raise ConfigError(f"unknown protocol {protocol!r} of OrientedBoxF1, choose one of: {known}")
         if not iou_thresholds:
             raise ConfigError("OrientedBoxF1 needs at least one IoU threshold, e.g. [0.25, 0.5]")
-        self.protocol = protocol
+        super().__init__(protocol=protocol, **kwargs)
         self.drops_missing = protocol == "odam"
         self.cad_half_extents = None if cad_half_extents is None else dict(cad_half_extents)
         self.iou_thresholds = tuple(iou_thresholds)
@@ -141,8 +141,7 @@ class OrientedBoxF1(ProtocolMetric):
         }
         return BoxF1Result(per_threshold=per_threshold, n_scenes=len(self.scenes()))
 
-    @staticmethod
-    def _scores_at(column: int, predictions: Tensor, true_label: Tensor) -> ThresholdScores:
+    def _scores_at(self, column: int, predictions: Tensor, true_label: Tensor) -> ThresholdScores:
         """Return the scores of one threshold, whose matches are in ``column`` of ``predictions``."""
         label, score, matched = predictions[:, 0], predictions[:, 1], predictions[:, column].long()
         n_true = len(true_label)
@@ -151,7 +150,7 @@ class OrientedBoxF1(ProtocolMetric):
             for k in true_label.unique()
         ]
         per_class = {
-            CLASSES[int(k)]: detection_scores(
+            self.classes.names[int(k)]: detection_scores(
                 int(matched[label == k].sum()), int((label == k).sum()), int((true_label == k).sum())
             )
             for k in torch.cat([true_label, label]).unique()
@@ -170,7 +169,11 @@ class OrientedBoxF1(ProtocolMetric):
         for index, (label, best, *matched) in enumerate(record.truths.tolist()):
             if label < 0:
                 continue
-            row: Row = {"scene_id": record.scene_id, "object": index, "category": CLASSES[int(label)]}
+            row: Row = {
+                "scene_id": record.scene_id,
+                "object": index,
+                "category": self.classes.names[int(label)],
+            }
             rows.append(
                 row | {"best_iou": best} | self._by_threshold("matched", [bool(value) for value in matched])
             )
@@ -196,4 +199,4 @@ def _counted(truths: Tensor) -> Tensor:
 
 
 def _labels(alignments: CadAlignments) -> Tensor:
-    return torch.tensor([CLASSES.index(name) for name in alignments.category], dtype=torch.int64)
+    return torch.tensor([PAPER_CLASSES.index(name) for name in alignments.category], dtype=torch.int64)

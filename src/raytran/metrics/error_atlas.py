@@ -12,7 +12,7 @@ from torch import Tensor
 from raytran.metrics.functional.alignment import SCAN2CAD_LIMITS, alignment_errors
 from raytran.metrics.functional.detection import match_in_order, score_order
 from raytran.metrics.per_scene import ObjectMetric, Row, SceneRecord
-from raytran.structs import CLASSES, ObjectSet
+from raytran.structs import ObjectSet
 
 CAUSES: tuple[str, ...] = (
     "found",
@@ -57,7 +57,7 @@ class ErrorAtlas(ObjectMetric):
 
     Args:
         volume_extent: size of the voxel grid in metres, for ``outside the volume``.
-        **kwargs: see ``torchmetrics.Metric``.
+        **kwargs: see ``ObjectMetric``.
     """
 
     # An object: label, index into CAUSES. A prediction: label, index into FATES.
@@ -133,7 +133,8 @@ class ErrorAtlas(ObjectMetric):
         """Return the counts over all scenes."""
         truths, fates = self.truths().long(), self.predictions().long()
         per_class = {
-            name: _count(truths[truths[:, 0] == label, 1], CAUSES) for label, name in enumerate(CLASSES)
+            name: _count(truths[truths[:, 0] == label, 1], CAUSES)
+            for label, name in enumerate(self.classes.names)
         }
         objects = _count(truths[:, 1], CAUSES)
         return AtlasResult(
@@ -149,7 +150,7 @@ class ErrorAtlas(ObjectMetric):
             {
                 "scene_id": record.scene_id,
                 "object": index,
-                "category": CLASSES[int(label)],
+                "category": self.classes.names[int(label)],
                 "cause": CAUSES[int(cause)],
             }
             for index, (label, cause) in enumerate(record.truths.tolist())

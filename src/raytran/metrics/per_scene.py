@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
@@ -14,7 +14,8 @@ from torch import distributed as dist
 from torch.nn import Module
 from torchmetrics import Metric
 
-from raytran.errors import ShapeError
+from raytran.classes import PAPER_CLASSES, Classes
+from raytran.errors import ConfigError, ShapeError
 from raytran.structs import CadAlignments, ObjectSet, TensorStruct
 
 Row = dict[str, str | int | float | bool | None]
@@ -94,11 +95,19 @@ class ObjectMetric(SceneMetric):
 
     Every scene given counts, with or without predictions, unless ``drops_missing``: then a scene whose
     predictions are None, for which there is no result at all, is left out.
+
+    Args:
+        classes: of the objects, or their settings, see ``Classes.of``; None: the paper's nine.
+        **kwargs: see ``torchmetrics.Metric``.
     """
 
     prediction_columns: int
     judges_shapes = False  # else ``judge`` is given the objects without their shapes
     drops_missing: bool = False
+
+    def __init__(self, *, classes: Classes | Mapping[str, Any] | None = None, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.classes = Classes.of(classes)
 
     @abstractmethod
     def judge(self, predictions: Any, targets: Any) -> tuple[Tensor, Tensor]:
@@ -127,6 +136,7 @@ class ObjectMetric(SceneMetric):
 
         Raises:
             ShapeError: the three do not have the same length.
+            DataError: objects are of other classes than the metric.
         """
         if not len(predictions) == len(targets) == len(scene_ids):
             raise ShapeError(
@@ -137,6 +147,9 @@ class ObjectMetric(SceneMetric):
             if predicted is None and self.drops_missing:
                 continue
             objects = type(target).empty() if predicted is None else predicted
+            for one in (objects, target):
+                if isinstance(one, ObjectSet):
+                    one.check_classes(self.classes, "the metric")
             tables = self.judge(self._in_float64(objects), self._in_float64(target))
             self.add(SceneRecord(scene_id, *tables))
 
@@ -170,10 +183,35 @@ class ObjectMetric(SceneMetric):
         )
 
 
-class ProtocolMetric(ObjectMetric):
-    """Base of the metrics that follow a protocol: ``strict`` on boxes, published scripts on alignments."""
+def check_protocol_classes(protocol: str, classes: Classes) -> None:
+    """Raise if a protocol of a published script is asked for with other classes than those it is defined on.
 
-    protocol: str
+    Raises:
+        ConfigError: it is.
+    """
+    if classes.names != PAPER_CLASSES.names:
+        raise ConfigError(
+            f"protocol {protocol} is defined on Scan2CAD's nine classes, and these are {len(classes)} "
+            "others: choose protocol=strict, or classes=paper"
+        )
+
+
+class ProtocolMetric(ObjectMetric):
+    """Base of the metrics that follow a protocol: ``strict`` on boxes, published scripts on alignments.
+
+    Args:
+        protocol: its name.
+        **kwargs: see ``ObjectMetric``.
+
+    Raises:
+        ConfigError: a published script's is asked for with other classes than its own.
+    """
+
+    def __init__(self, *, protocol: str, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.protocol = protocol
+        if protocol != "strict":
+            check_protocol_classes(protocol, self.classes)
 
     def judge(
         self, predictions: ObjectSet | CadAlignments, targets: ObjectSet | CadAlignments

@@ -9,6 +9,7 @@ from typing import Any, NotRequired, TypedDict
 import torch
 from torch import Tensor
 
+from raytran.classes import PAPER_CLASSES
 from raytran.errors import ConfigError
 from raytran.metrics.functional.alignment import SCAN2CAD_LIMITS, AlignmentErrors, alignment_errors
 from raytran.metrics.functional.cad_errors import cad_symmetries, equal_names
@@ -16,12 +17,12 @@ from raytran.metrics.functional.detection import match_in_order, score_order
 from raytran.metrics.functional.scan2cad import match_scan2cad
 from raytran.metrics.functional.vid2cad import VID2CAD_CLASS_BY_CATID, match_vid2cad
 from raytran.metrics.per_scene import ProtocolMetric, Row, SceneRecord
-from raytran.structs import CLASSES, CadAlignments, ObjectSet
+from raytran.structs import CadAlignments, ObjectSet
 
 SCAN2CAD_PROTOCOLS: tuple[str, ...] = ("strict", "scan2cad", "vid2cad")
 
 _BED = "bed"
-_CLASSES_OF_VID2CAD: tuple[str, ...] = (*CLASSES[:-1], _BED)
+_CLASSES_OF_VID2CAD: tuple[str, ...] = (*PAPER_CLASSES.names[:-1], _BED)
 
 
 class ClassAccuracy(TypedDict):
@@ -53,7 +54,7 @@ class Scan2CADAccuracy(ProtocolMetric):
 
     It is a recall: predictions too many cost nothing. Protocol ``strict``, which compares ``ObjectSet``s:
 
-    - every scene counts, also one without predictions; all nine classes, matched by name;
+    - every scene counts, also one without predictions; all classes, matched by name;
     - predictions choose by score, and each takes the first annotated object still free that it fits;
     - translation is the distance of the box centres; size error is ``|mean(size / true size) - 1|``;
     - rotation is the full angle, the least over the annotated object's symmetry;
@@ -74,7 +75,7 @@ class Scan2CADAccuracy(ProtocolMetric):
         max_translation: metres, inclusive.
         max_rotation: degrees, inclusive.
         max_scale: ratio, inclusive.
-        **kwargs: see ``torchmetrics.Metric``.
+        **kwargs: see ``ObjectMetric``.
 
     Raises:
         ConfigError: the protocol is unknown.
@@ -96,13 +97,12 @@ class Scan2CADAccuracy(ProtocolMetric):
         max_scale: float = SCAN2CAD_LIMITS[2],
         **kwargs: Any,
     ) -> None:
-        super().__init__(**kwargs)
         if protocol not in SCAN2CAD_PROTOCOLS:
             known = ", ".join(SCAN2CAD_PROTOCOLS)
             raise ConfigError(f"unknown protocol {protocol!r} of Scan2CADAccuracy, choose one of: {known}")
-        self.protocol = protocol
+        super().__init__(protocol=protocol, **kwargs)
         self.drops_missing = protocol == "scan2cad"
-        self.class_names = _CLASSES_OF_VID2CAD if protocol == "vid2cad" else CLASSES
+        self.class_names = _CLASSES_OF_VID2CAD if protocol == "vid2cad" else self.classes.names
         self.cad_symmetries = None if cad_symmetries is None else dict(cad_symmetries)
         self.limits = (max_translation, max_rotation, max_scale)
 

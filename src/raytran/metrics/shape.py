@@ -14,7 +14,7 @@ from raytran.metrics.functional.alignment import SCAN2CAD_LIMITS, alignment_erro
 from raytran.metrics.functional.detection import match_in_order, score_order
 from raytran.metrics.functional.shape import chamfer_distance, grid_iou, surface_points
 from raytran.metrics.per_scene import ObjectMetric, Row, SceneRecord
-from raytran.structs import CLASSES, ObjectSet
+from raytran.structs import ObjectSet
 
 
 class ClassShapes(TypedDict):
@@ -47,7 +47,7 @@ class MatchedShapeScores(ObjectMetric):
     counts errors of the pose, which the accuracy counts.
 
     Args:
-        **kwargs: see ``torchmetrics.Metric``.
+        **kwargs: see ``ObjectMetric``.
     """
 
     # Label, whether it is matched, IoU and chamfer distance, NaN where there is none.
@@ -80,7 +80,7 @@ class MatchedShapeScores(ObjectMetric):
         """Return the means over all matched objects and over those of each class."""
         truths = self.truths()
         matched = truths[truths[:, 1] == 1]
-        per_class = {name: _means(matched[matched[:, 0] == k]) for k, name in enumerate(CLASSES)}
+        per_class = {name: _means(matched[matched[:, 0] == k]) for k, name in enumerate(self.classes.names)}
         n_empty = int(matched[:, 3].isnan().sum())
         return ShapeResult(**_means(matched), n_empty=n_empty, per_class=per_class)
 
@@ -90,7 +90,7 @@ class MatchedShapeScores(ObjectMetric):
             {
                 "scene_id": record.scene_id,
                 "object": index,
-                "category": CLASSES[int(label)],
+                "category": self.classes.names[int(label)],
                 "shape_iou": None if math.isnan(iou) else iou,
                 "chamfer_distance_m": None if math.isnan(distance) else distance,
             }

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 from torch import Tensor, nn
 
+from raytran.classes import PAPER_CLASSES, Classes
 from raytran.metrics.accuracy_curves import AccuracyCurves, accuracy_by_scene_size
 from raytran.metrics.box_f1 import OrientedBoxF1
 from raytran.metrics.error_atlas import ErrorAtlas
@@ -22,14 +23,21 @@ class StrictScores(nn.Module):
     Args:
         explain: with ``AccuracyCurves``, ``ErrorAtlas`` and the accuracy by the size of the scene.
         volume_extent: size of the voxel grid, metres, for the atlas; None: unknown.
+        classes: of the objects.
     """
 
-    def __init__(self, *, explain: bool = True, volume_extent: Sequence[float] | None = None) -> None:
+    def __init__(
+        self,
+        *,
+        explain: bool = True,
+        volume_extent: Sequence[float] | None = None,
+        classes: Classes = PAPER_CLASSES,
+    ) -> None:
         super().__init__()
-        self.accuracy = Scan2CADAccuracy()
-        self.box_f1 = OrientedBoxF1()
-        self.curves = AccuracyCurves() if explain else None
-        self.atlas = ErrorAtlas(volume_extent=volume_extent) if explain else None
+        self.accuracy = Scan2CADAccuracy(classes=classes)
+        self.box_f1 = OrientedBoxF1(classes=classes)
+        self.curves = AccuracyCurves(classes=classes) if explain else None
+        self.atlas = ErrorAtlas(volume_extent=volume_extent, classes=classes) if explain else None
 
     def update(
         self,

@@ -12,12 +12,13 @@ import trimesh
 from PIL import Image, ImageDraw
 from torch import Tensor
 
+from raytran.classes import Color
 from raytran.data.views import choose_even
 from raytran.geometry.camera import Cameras
 from raytran.geometry.rasterize import rasterize_ids
 from raytran.pictures.palette import font, ink_on
 from raytran.pictures.wireframe import box_segments
-from raytran.structs import CLASS_COLORS, CLASSES, ObjectSet, ScenePrediction, Views
+from raytran.structs import ObjectSet, ScenePrediction, Views
 
 _FILL = 0.5
 _OVERSAMPLING = 2
@@ -104,14 +105,19 @@ def draw_objects(
     camera_from_object = (objects.center - camera.position.to(objects.center)).norm(dim=-1)
     far_first = camera_from_object.argsort(descending=True).tolist()
     for m in far_first:
-        color = CLASS_COLORS[int(objects.label[m])]
+        color = objects.classes.colors[int(objects.label[m])]
         for u0, v0, u1, v1, front in segments[m]:
             line = [_OVERSAMPLING * value for value in (u0, v0, u1, v1)]
             pen.line(line, fill=color, width=_OVERSAMPLING * (3 if front else 1) + 1)
     picture = large.resize(frame.size, Image.Resampling.BOX)
     pen = ImageDraw.Draw(picture)
     for m in far_first:
-        _write_name(pen, frame.size, segments[m], int(objects.label[m]), float(objects.score[m]))
+        label = int(objects.label[m])
+        text, color = (
+            f"{objects.classes.names[label]} {float(objects.score[m]):.2f}",
+            objects.classes.colors[label],
+        )
+        _write_name(pen, frame.size, segments[m], text, color)
     return picture
 
 
@@ -123,7 +129,7 @@ def _fill_meshes(
         return image
     one = camera[None]
     ids, depth = (result[0] for result in rasterize_ids([(m.vertices, m.faces) for _, m in shown], one))
-    colors = torch.tensor(CLASS_COLORS)[objects.label[[i for i, _ in shown]].cpu()]
+    colors = torch.tensor(objects.classes.colors)[objects.label[[i for i, _ in shown]].cpu()]
     covered = ids >= 0
     edge = torch.zeros_like(covered)
     edge[:, 1:] |= ids[:, 1:] != ids[:, :-1]
@@ -154,8 +160,8 @@ def _write_name(
     pen: ImageDraw.ImageDraw,
     size: tuple[int, int],
     segments: Sequence[tuple[float, float, float, float, bool]],
-    label: int,
-    score: float,
+    text: str,
+    color: Color,
 ) -> None:
     ends = np.array([end for u0, v0, u1, v1, _ in segments for end in ((u0, v0), (u1, v1))]).reshape(-1, 2)
     low, high = (
@@ -164,11 +170,10 @@ def _write_name(
     width, height = size
     if low[0] >= width or low[1] >= height or high[0] <= 0 or high[1] <= 0:
         return
-    text, type_face = f"{CLASSES[label]} {score:.2f}", font(max(13, height // 26))
+    type_face = font(max(13, height // 26))
     left, top, right, bottom = pen.textbbox((0, 0), text, font=type_face)
     middle = (max(low[0], 0) + min(high[0], width)) / 2
     x = float(np.clip(middle - (right - left) / 2, 2, max(width - (right - left) - 4, 2)))
     y = float(np.clip(low[1] - (bottom - top) - 4, 2, height - (bottom - top) - 4))
-    color = CLASS_COLORS[label]
     pen.rectangle([x - 2, y - 1, x + right - left + 2, y + bottom - top + 3], fill=color)
     pen.text((x - left, y - top + 1), text, font=type_face, fill=ink_on(color))

@@ -7,18 +7,11 @@ from functools import cache
 
 from PIL import ImageFont
 
-from raytran.structs import CLASS_COLORS
-
 INK = "#1d2530"
 """Axes, text and truth outlines on white paper."""
 
 FAINT = "#8a94a3"
 """Ticks, grids and the camera path."""
-
-
-def class_hex(label: int) -> str:
-    """Return the class's colour as ``#rrggbb``."""
-    return "#{:02x}{:02x}{:02x}".format(*CLASS_COLORS[label])
 
 
 def ink_on(color: tuple[int, int, int]) -> tuple[int, int, int]:

@@ -14,10 +14,11 @@ from matplotlib.patches import Patch, Polygon
 from scipy.spatial import ConvexHull
 from torch import Tensor
 
+from raytran.classes import Classes
 from raytran.geometry.camera import Cameras
-from raytran.pictures.palette import FAINT, INK, class_hex
+from raytran.pictures.palette import FAINT, INK
 from raytran.pictures.wireframe import box_corners
-from raytran.structs import CLASSES, ObjectSet, ScenePrediction
+from raytran.structs import ObjectSet, ScenePrediction
 
 _MARGIN = 0.4
 """Metres of floor around everything that is drawn."""
@@ -64,7 +65,7 @@ def draw_topdown(
     count = f"{len(objects)} object{'' if len(objects) == 1 else 's'}" if len(objects) else "no objects found"
     axes.set_title(title or f"{prediction.scene_id}: {count}", loc="left", color=INK, fontsize=13)
     present = set(objects.label.tolist()) | (set() if truth is None else set(truth.label.tolist()))
-    _legend(axes, sorted(present), with_truth=truth is not None)
+    _legend(axes, objects.classes, sorted(present), with_truth=truth is not None)
     figure.savefig(path, bbox_inches="tight", pad_inches=0.15)
     return path
 
@@ -85,7 +86,7 @@ def _draw_boxes(axes: Axes, objects: ObjectSet, *, predicted: bool) -> None:
             if np.ptp(corners[i], axis=0).min() > 0
             else corners[i]
         )
-        color = class_hex(label)
+        color = objects.classes.hex(label)
         if not predicted:
             axes.add_patch(
                 Polygon(outline, fill=False, edgecolor=color, linewidth=1.8, linestyle=(0, (3, 2)), zorder=5)
@@ -99,7 +100,7 @@ def _draw_boxes(axes: Axes, objects: ObjectSet, *, predicted: bool) -> None:
         arrow = [edge - side, edge + side, edge + 1.2 * _FRONT_MARK * fronts[i]]
         axes.add_patch(Polygon(arrow, facecolor=INK, edgecolor="white", linewidth=0.6, zorder=6))
         axes.annotate(
-            f"{i:02d} {CLASSES[label]} {float(objects.score[i]):.2f}",
+            f"{i:02d} {objects.classes.names[label]} {float(objects.score[i]):.2f}",
             center[i],
             xytext=(0, 0),
             textcoords="offset points",
@@ -151,9 +152,9 @@ def _frame(axes: Axes, sets: list[ObjectSet], positions: Tensor) -> None:
     axes.spines[:].set_color("#c9cfd8")
 
 
-def _legend(axes: Axes, labels: list[int], *, with_truth: bool) -> None:
+def _legend(axes: Axes, classes: Classes, labels: list[int], *, with_truth: bool) -> None:
     entries: list[Patch | Line2D] = [
-        Patch(facecolor=class_hex(label), label=CLASSES[label]) for label in labels
+        Patch(facecolor=classes.hex(label), label=classes.names[label]) for label in labels
     ]
     if with_truth:
         entries.append(Line2D([], [], color=INK, linestyle=(0, (3, 2)), label="truth"))

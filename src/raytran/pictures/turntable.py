@@ -19,7 +19,7 @@ from raytran.geometry.camera import Cameras, pose_from_heading
 from raytran.geometry.rasterize import rasterize_ids
 from raytran.pictures.overlay import headlight
 from raytran.pictures.wireframe import NEAR, box_corners, box_edges
-from raytran.structs import CLASS_COLORS, ObjectSet
+from raytran.structs import ObjectSet
 
 SIZE = (360, 480)
 """Rows and columns of the picture."""
@@ -105,7 +105,8 @@ def turntable_frames(
     lines = _lines(objects, walk, low, high, floor)
     orbit = _orbit(points, num_frames)
     shown = [(i, mesh) for i, mesh in enumerate(meshes) if mesh is not None and len(mesh.faces)]
-    colors = np.array(CLASS_COLORS, dtype=np.float32)[objects.label.cpu().numpy()][[i for i, _ in shown]]
+    of_class = np.array(objects.classes.colors, dtype=np.float32)
+    colors = of_class[objects.label.cpu().numpy()][[i for i, _ in shown]]
     ids, depths = rasterize_ids([(mesh.vertices, mesh.faces) for _, mesh in shown], orbit)
     # The pixels' rays in the frame of the camera, which are the same all the way round.
     upright = Cameras(orbit.intrinsics[0], torch.eye(4).double(), SIZE)
@@ -162,7 +163,7 @@ def _lines(objects: ObjectSet, walk: Tensor, low: Tensor, high: Tensor, floor: f
     edges, front = box_edges()
     ends.append(box_corners(objects).double().cpu()[:, edges].reshape(-1, 2, 3))
     for label in objects.label.tolist():
-        colors += [CLASS_COLORS[label]] * len(edges)
+        colors += [objects.classes.colors[label]] * len(edges)
         widths += [4 if bold else 2 for bold in front]
     return _Lines(torch.cat(ends), colors, widths)
 

@@ -101,7 +101,7 @@ class CadModel:
     Attributes:
         catid: ShapeNet's synset.
         model_id: 32 hexadecimal digits that name the geometry and colours.
-        category: one of ``raytran.structs.CLASSES``.
+        category: one of the paper's classes.
         kind: kind of furniture, e.g. ``office chair``.
         vertices: ``(V, 3)`` float64.
         faces: ``(F, 3)`` int64, wound outwards; several closed parts that may overlap.

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from raytran.classes import PAPER_CLASSES
 from raytran.rooms.cad import CadModel
 from raytran.rooms.layout import Layout
 from raytran.rooms.library import ModelPool
-from raytran.structs import CLASSES
 
 ROOM_KINDS = {
     "office": 0.26,
@@ -87,9 +87,9 @@ class Furnisher:
     def extra(self, name: str) -> None:
         """Place one more piece; nothing happens if it finds no place."""
         rng, layout = self.layout.rng, self.layout
-        kinds = _OTHERS.get(name, () if name in CLASSES else (name,))
+        kinds = _OTHERS.get(name, () if name in PAPER_CLASSES.names else (name,))
         present = [o for o in layout.objects if o.model.category == name or o.model.kind in kinds]
-        if len(present) >= _MOST.get(name, self.wanted if name in CLASSES else 2):
+        if len(present) >= _MOST.get(name, self.wanted if name in PAPER_CLASSES.names else 2):
             return
         model = self.draw("other", *kinds) if kinds else self.draw(name)
         if model is None:

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from raytran.structs import CLASS_BY_CATID
+from raytran.classes import SCAN2CAD_CLASS_BY_CATID
 
-CATID_BY_CLASS = {name: catid for catid, name in CLASS_BY_CATID.items()}
+CATID_BY_CLASS = {name: catid for catid, name in SCAN2CAD_CLASS_BY_CATID.items()}
 """ShapeNet's synset of every class but ``other``."""
 
 
@@ -23,7 +23,7 @@ class Kind:
     """What all pieces of one kind have in common.
 
     Attributes:
-        category: one of ``raytran.structs.CLASSES``.
+        category: one of the paper's classes.
         catid: ShapeNet's synset.
         support: where it stands (see ``CadModel.support``).
     """
@@ -141,7 +141,7 @@ _GUESSES: dict[str, tuple[_Guess, ...]] = {
     "04554684": (_Guess("washing machine", "height", (0.85, 0.95)),),
 }
 
-KNOWN_CATIDS = (*CLASS_BY_CATID, *(name for name in _GUESSES if name.isdigit()))
+KNOWN_CATIDS = (*SCAN2CAD_CLASS_BY_CATID, *(name for name in _GUESSES if name.isdigit()))
 """ShapeNet's synsets that rooms are furnished from."""
 
 
@@ -166,5 +166,5 @@ def draw_size(catid: str, extent: ArrayLike, rng: np.random.Generator) -> NDArra
 
 
 def _guess(catid: str, extent: Sequence[float]) -> _Guess:
-    guesses = _GUESSES[CLASS_BY_CATID.get(catid, catid)]
+    guesses = _GUESSES[SCAN2CAD_CLASS_BY_CATID.get(catid, catid)]
     return next(guess for guess in guesses if guess.fits(extent[0], extent[1], extent[2]))

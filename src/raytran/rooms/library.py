@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from raytran.classes import OTHER, PAPER_CLASSES, SCAN2CAD_CLASS_BY_CATID
 from raytran.data.files import write_json
 from raytran.data.shapenet.meshes import read_face_colors
 from raytran.data.shapenet.models import mesh_path, model_names, read_mesh
@@ -23,7 +24,6 @@ from raytran.limits import BOX_SIDE, COORDINATE, as_numbers
 from raytran.rooms.cad import OTHER_IDS, CadModel, sample_model
 from raytran.rooms.kinds import KINDS, KNOWN_CATIDS, draw_size, guess_kind
 from raytran.rooms.symmetry import measure_symmetry
-from raytran.structs import CLASS_BY_CATID, CLASSES
 
 MODELS_PER_CATEGORY = 150
 """Models of one synset that are examined; of more, these are chosen by the hashes of their names."""
@@ -51,7 +51,7 @@ class LibraryModel:
     Attributes:
         catid: ShapeNet's synset.
         model_id: ShapeNet's name of the model.
-        category: one of ``raytran.structs.CLASSES``.
+        category: one of the paper's classes.
         kind: name in ``KINDS``.
         symmetry: as in ``CadModel``; from the model's ``.json``, or measured.
         size_m: real size along the object's axes, metres; from the model's ``.json``, or drawn.
@@ -214,7 +214,7 @@ def _model(root: Path, catid: str, model_id: str) -> LibraryModel:
     return LibraryModel(
         catid=catid,
         model_id=model_id,
-        category=CLASS_BY_CATID.get(catid, "other"),
+        category=SCAN2CAD_CLASS_BY_CATID.get(catid, OTHER),
         kind=kind,
         symmetry=symmetry,
         # One factor takes the normalised model to its real size: its diagonal in metres.
@@ -314,4 +314,4 @@ class ModelPool:
 @lru_cache(maxsize=2048)
 def _generated(seed: int, category: str, number: int) -> CadModel:
     # Scenes are seeded by two numbers, models by three: the streams never meet.
-    return sample_model(category, np.random.default_rng([seed, CLASSES.index(category), number]))
+    return sample_model(category, np.random.default_rng([seed, PAPER_CLASSES.index(category), number]))

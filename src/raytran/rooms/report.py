@@ -10,6 +10,7 @@ from typing import Any
 import trimesh
 from PIL import Image
 
+from raytran.classes import PAPER_CLASSES
 from raytran.data.files import whole_file, write_json, write_text
 from raytran.data.prepare.report import class_table
 from raytran.data.scan2cad import SceneAnnotation, read_annotations, scene_objects
@@ -18,7 +19,6 @@ from raytran.data.targets import cad_meshes
 from raytran.pictures.overlay import draw_objects
 from raytran.pictures.panels import contact_sheet
 from raytran.rooms.statistics import listed_scans, look, rooms_statistics, scan_cameras
-from raytran.structs import CLASSES
 
 _ROOMS_SHOWN = 5
 """Rooms of each split on the sheet: a row of frames and a row of the same with their objects drawn in."""
@@ -46,10 +46,12 @@ def rooms_text(statistics: Mapping[str, Mapping[str, Any]]) -> str:
     for what, cells in _rows(list(statistics.values())):
         lines.append(f"{what:<35}" + "".join(f"{cell:>18}" for cell in cells))
     by_class = {name: of_split["by_class"] for name, of_split in statistics.items()}
-    counts = {split: {name: of[name]["objects"] for name in CLASSES} for split, of in by_class.items()}
+    counts = {
+        split: {name: of[name]["objects"] for name in PAPER_CLASSES.names} for split, of in by_class.items()
+    }
     sizes = [
         f"         {name:<11}" + "".join(f"{_size(of[name]['size_m']):>22}" for of in by_class.values())
-        for name in CLASSES
+        for name in PAPER_CLASSES.names
     ]
     header = "Median width × height × depth, m" + "  " + ", ".join(by_class)
     return "\n".join([*lines, "", *class_table(counts), "", header, *sizes]) + "\n"

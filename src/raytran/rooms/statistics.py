@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from raytran.classes import PAPER_CLASSES
 from raytran.data.scan2cad import SceneAnnotation, read_annotations, scene_objects
 from raytran.data.scannet.scan import read_scan
 from raytran.data.scene_list import read_split
@@ -19,7 +20,7 @@ from raytran.data.targets import cad_meshes
 from raytran.data.views import choose_even
 from raytran.geometry.camera import Cameras
 from raytran.geometry.rasterize import rasterize_ids, rasterize_mask
-from raytran.structs import CLASSES, ObjectSet
+from raytran.structs import ObjectSet
 
 SPLITS = ("train", "val", "test")
 
@@ -129,7 +130,7 @@ def _by_class(scenes: Sequence[ObjectSet]) -> dict[str, dict[str, Any]]:
     size = torch.cat([objects.size for objects in scenes])
     return {
         name: {"objects": int((label == index).sum()), "size_m": _median(size[label == index])}
-        for index, name in enumerate(CLASSES)
+        for index, name in enumerate(PAPER_CLASSES.names)
     }
 
 

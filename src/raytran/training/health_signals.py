@@ -13,7 +13,7 @@ from torch.nn.modules.batchnorm import _BatchNorm
 
 from raytran.losses.matcher import HungarianMatcher
 from raytran.losses.objects import TrueObjects
-from raytran.structs import PADDING, ObjectSet, RawObjects
+from raytran.structs import ObjectSet, RawObjects
 from raytran.training.ranks import mean_over_ranks
 
 
@@ -58,8 +58,9 @@ def slot_signals(
     right = (surest == true.label[match.target[0]]).float().sum()
     matched = right.new_full((), match.query.shape[1])
     log_probability = objects.class_logits.log_softmax(dim=-1)
-    entropy = -(log_probability.exp() * log_probability).sum(dim=-1) / math.log(PADDING + 1)
-    used = (log_probability.argmax(dim=-1) != PADDING).float()
+    outputs = log_probability.shape[-1]
+    entropy = -(log_probability.exp() * log_probability).sum(dim=-1) / math.log(outputs)
+    used = (log_probability.argmax(dim=-1) != outputs - 1).float()
     sums = torch.stack([right, matched, entropy.mean(), used.mean()])
     right, matched, entropy, used = mean_over_ranks(sums).unbind()
     found = {"class_entropy": entropy, "slots_used": used}

@@ -56,7 +56,7 @@ class Reconstruction(pl.LightningModule):
         self.loss = loss
         self.stage = stage
         self.optimization = optimization
-        self.scores = SceneScores(tasks=stage.tasks, metrics=metrics)
+        self.scores = SceneScores(tasks=stage.tasks, metrics=metrics, classes=model.classes)
         self._compiled = torch.compile(model.forward) if compiled else None
         self._val_losses: dict[str, MeanMetric] = {}
         self._gradient_norms: dict[str, Tensor] | None = None
@@ -179,6 +179,8 @@ class Reconstruction(pl.LightningModule):
         return weights_cast_together(self.model, self.device.type)
 
     def _losses(self, raw: RawScene, batch: SceneBatch, **options: Any) -> dict[str, Tensor]:
+        for objects in batch.objects or ():
+            objects.check_classes(self.model.classes, "the network")
         return self.loss(
             raw, batch, terms=self.stage.terms, decode_shapes=self.model.decode_shapes, **options
         )

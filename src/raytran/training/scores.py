@@ -10,6 +10,7 @@ import torch
 from torch import nn
 from torchmetrics import Metric
 
+from raytran.classes import PAPER_CLASSES, Classes
 from raytran.metrics.box_f1 import OrientedBoxF1
 from raytran.metrics.new_views import NewViewScores
 from raytran.metrics.occupancy_iou import ForegroundIoU, SceneOccupancyIoU
@@ -34,6 +35,7 @@ class SceneScores(nn.Module):
             (``ErrorAtlas``) and how many would be found at other thresholds (``AccuracyCurves``).
         metrics: further ones by name, e.g. of your own: ``update(batch, predictions)`` gets what ``update``
             here gets, objects of every score among it, and ``compute()`` returns one number. None for none.
+        classes: of the objects.
     """
 
     def __init__(
@@ -44,16 +46,19 @@ class SceneScores(nn.Module):
         duplicate_iou: float | None = DUPLICATE_IOU,
         volume_extent: Sequence[float] | None = None,
         metrics: Mapping[str, Metric] | None = None,
+        classes: Classes = PAPER_CLASSES,
     ) -> None:
         super().__init__()
         self._score_threshold = score_threshold
         self._duplicate_iou = duplicate_iou
         self.strict = self.box_f1_of_all = None
         if "objects" in tasks:
-            self.strict = StrictScores(explain=volume_extent is not None, volume_extent=volume_extent)
+            self.strict = StrictScores(
+                explain=volume_extent is not None, volume_extent=volume_extent, classes=classes
+            )
             # Predictions of every score, to tell which threshold would have been the best.
-            self.box_f1_of_all = OrientedBoxF1()
-        self.shape = MatchedShapeScores() if "shape" in tasks else None
+            self.box_f1_of_all = OrientedBoxF1(classes=classes)
+        self.shape = MatchedShapeScores(classes=classes) if "shape" in tasks else None
         self.occupancy = SceneOccupancyIoU() if "occupancy" in tasks else None
         self.foreground = ForegroundIoU() if "foreground" in tasks else None
         self.new_views = NewViewScores() if "view" in tasks else None

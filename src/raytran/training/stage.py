@@ -63,7 +63,7 @@ class Stage:
                 raise ConfigError(f"{self.name} trains '{part}', which the model does not have")
         idle = self._idle(model)
         for name, parameter in model.named_parameters():
-            parameter.requires_grad_(_is_within(name, self.trainable) and not _is_within(name, idle))
+            parameter.requires_grad_(is_within(name, self.trainable) and not is_within(name, idle))
 
     def training_modes(self, model: RayTran) -> list[tuple[nn.Module, bool]]:
         """Return every module of ``model`` and whether it is in training mode during this stage.
@@ -75,7 +75,7 @@ class Stage:
         modes = []
         for name, module in model.named_modules():
             holds_trained = name == "" or any(part.startswith(f"{name}.") for part in self.trainable)
-            trained = _is_within(name, self.trainable) and not _is_within(name, idle)
+            trained = is_within(name, self.trainable) and not is_within(name, idle)
             keeps_statistics = self.freeze_norms and isinstance(module, _BatchNorm)
             modes.append((module, (trained or holds_trained) and not keeps_statistics))
         return modes
@@ -90,6 +90,6 @@ class Stage:
         return model.idle_modules({*self.tasks, *self.terms})
 
 
-def _is_within(name: str, parts: Sequence[str]) -> bool:
+def is_within(name: str, parts: Sequence[str]) -> bool:
     """Say whether the module or parameter ``name`` is one of ``parts`` or inside one."""
     return any(name == part or name.startswith(f"{part}.") for part in parts)

@@ -14,7 +14,7 @@ from torch import Tensor
 from raytran.geometry.boxes import OrientedBoxes
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.rotation import yaw_from_rotation
-from raytran.structs import CLASS_COLORS, CLASSES, ObjectSet, SceneBatch, ScenePrediction
+from raytran.structs import ObjectSet, SceneBatch, ScenePrediction
 
 _TRUE = (255, 255, 255)
 _CAMERA = (255, 200, 0)
@@ -35,11 +35,11 @@ def scene_in_3d(
         grid_extent: sizes of the voxel grid, metres.
     """
     truth = ObjectSet.empty() if batch.objects is None else batch.objects[0]
-    boxes = [_box(truth, i, f"true {CLASSES[int(truth.label[i])]}", _TRUE) for i in range(len(truth))]
+    boxes = [_box(truth, i, f"true {name}", _TRUE) for i, name in enumerate(truth.category)]
     found = prediction.objects
     for i, label in enumerate(found.label.tolist()):
-        text = f"{CLASSES[label]} {float(found.score[i]):.2f}"
-        boxes.append(_box(found, i, text, CLASS_COLORS[label]))
+        text = f"{found.classes.names[label]} {float(found.score[i]):.2f}"
+        boxes.append(_box(found, i, text, found.classes.colors[label]))
     points = np.vstack(
         [
             _colored(batch.views.world_from_camera[0, :, :3, 3], _CAMERA),
@@ -58,7 +58,7 @@ def object_table(scenes: Sequence[tuple[SceneBatch, ScenePrediction]]) -> Any:
             yaw = yaw_from_rotation(objects.rotation).rad2deg()
             for i in range(len(objects)):
                 numbers = torch.cat([objects.center[i], objects.size[i], yaw[i, None]]).double()
-                label, score = CLASSES[int(objects.label[i])], float(objects.score[i])
+                label, score = objects.category[i], float(objects.score[i])
                 table.add_data(prediction.scene_id, kind, label, score, *numbers.tolist())
     return table
 

@@ -21,7 +21,7 @@ from viser.transforms import SO3
 from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
 from raytran.pictures.wireframe import box_segments
-from raytran.structs import CLASS_COLORS, CLASSES, ObjectSet
+from raytran.structs import ObjectSet
 from raytran.viewer.attention import ReadPixels
 from raytran.viewer.data import ViewerScene, read_viewer_scene
 from raytran.viewer.scene import (
@@ -211,7 +211,7 @@ class ViewerApp:
         labels = [scene.objects.label] if scene.truth is None else [scene.objects.label, scene.truth.label]
         with gui.add_folder("Classes", expand_by_default=False):
             self.classes = {
-                label: gui.add_checkbox(CLASSES[label], True)
+                label: gui.add_checkbox(scene.objects.classes.names[label], True)
                 for label in sorted(set(torch.cat(labels).tolist()))
             }
         self.occupancy: viser.GuiSliderHandle[float] | None = None
@@ -351,7 +351,7 @@ def draw_boxes(image: Pixels, camera: Cameras, objects: ObjectSet) -> Pixels:
     scaled = camera.scaled_to((picture.height, picture.width))
     for label, segments in zip(objects.label.tolist(), box_segments(objects, scaled), strict=True):
         for *line, is_front in segments:
-            pen.line(line, fill=CLASS_COLORS[label], width=3 if is_front else 1)
+            pen.line(line, fill=objects.classes.colors[label], width=3 if is_front else 1)
     return np.asarray(picture)
 
 
@@ -371,7 +371,7 @@ def object_table(scene: ViewerScene, shown: Shown) -> str:
     lines += ["", "| object | score |" + (" cm | ° | size | IoU |" if with_errors else "")]
     lines += ["|---|--:|" + "--:|" * (4 if with_errors else 0)]
     for i in visible:
-        name, score = CLASSES[int(scene.objects.label[i])], float(scene.objects.score[i])
+        name, score = scene.objects.category[i], float(scene.objects.score[i])
         error = scene.errors[i]
         mark = "" if error is None else " ✓" if error.found else " ✗"
         line = f"| {i:02d} {name}{mark} | {score:.2f} |"
@@ -386,10 +386,10 @@ def object_table(scene: ViewerScene, shown: Shown) -> str:
 
 def describe_found(scene: ViewerScene, visible: Sequence[int]) -> str:
     """Return how many true objects the visible ones found, and the classes of those they missed."""
-    truth = [] if scene.truth is None else scene.truth.label.tolist()
+    truth = () if scene.truth is None else scene.truth.category
     errors = [scene.errors[i] for i in visible]
     found = {error.truth for error in errors if error is not None and error.found}
-    missed = Counter(CLASSES[label] for i, label in enumerate(truth) if i not in found)
+    missed = Counter(name for i, name in enumerate(truth) if i not in found)
     text = f"**{len(found)} of {len(truth)}** true ones found"
     return f"{text}; missed: {', '.join(f'{n} {name}' for name, n in missed.items())}" if missed else text
 

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
+from raytran.classes import PAPER_CLASSES, Classes
 from raytran.data.images import decode_image
 from raytran.data.scannet.text import are_rigid
 from raytran.data.text import as_name, parse_json
@@ -44,7 +45,7 @@ from raytran.limits import (
 )
 from raytran.ops.traverse import trace_pairs
 from raytran.pictures.overlay import frame_image
-from raytran.structs import CLASSES, ObjectSet, ScenePrediction, Views
+from raytran.structs import ObjectSet, ScenePrediction, Views
 from raytran.viewer.archive import read_arrays
 from raytran.viewer.attention import ReadPixels, VoxelReads, attention_weights, pack_reads
 from raytran.viewer.truth import ObjectError, object_errors
@@ -225,13 +226,15 @@ def write_viewer_data(
     Returns:
         the file.
     """
-    about = {
+    about: dict[str, Any] = {
         "format": FORMAT,
         "image_size": views.image_size,
         "frame_ids": list(frame_ids),
         "volumes": [_about_volume(volume) for volume in volumes],
         "has_truth": truth is not None,
     }
+    if truth is not None and truth.classes != PAPER_CLASSES:
+        about["classes"] = truth.classes.settings()
     arrays: dict[str, NDArray[Any]] = {
         "about": np.frombuffer(json.dumps(about).encode(), dtype=np.uint8),
         "intrinsics": views.intrinsics[0].double().cpu().numpy(),
@@ -302,7 +305,9 @@ def read_viewer_scene(folder: Path) -> ViewerScene:
             about = parse_json(arrays["about"].tobytes().decode(), "its description")
             if about["format"] != FORMAT:
                 raise ValueError(f"format {shown(about['format'])}, this version reads {FORMAT!r}")
-        truth = _truth(arrays) if about["has_truth"] else None
+        truth = _truth(arrays, Classes.of(about.get("classes"))) if about["has_truth"] else None
+        if truth is not None and truth.classes.names != objects.classes.names:
+            raise ValueError(f"its true objects have other classes than {SCENE}")
         names = [as_name(name, "a frame's name") for name in about["frame_ids"]]
         return ViewerScene(
             scene_id=result.scene_id,
@@ -353,10 +358,10 @@ def _image(content: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return decode_image(content.tobytes(), name=f"of a frame in {FILE}").permute(1, 2, 0).numpy()
 
 
-def _truth(arrays: Mapping[str, NDArray[Any]]) -> ObjectSet:
+def _truth(arrays: Mapping[str, NDArray[Any]], classes: Classes) -> ObjectSet:
     label, center, size, rotation, symmetry, score = (arrays[f"truth_{name}"] for name in _TRUTH)
     count = len(label)
-    as_numbers(label, (count,), Quantity("a class", 0, len(CLASSES) - 1), "label")
+    as_numbers(label, (count,), Quantity("a class", 0, len(classes) - 1), "label")
     as_numbers(symmetry, (count,), Quantity("a symmetry", 0, 64), "symmetry")
     as_numbers(center, (count, 3), POSITION, "center")
     as_numbers(size, (count, 3), BOX_SIDE, "size")
@@ -369,6 +374,7 @@ def _truth(arrays: Mapping[str, NDArray[Any]]) -> ObjectSet:
         rotation=torch.from_numpy(rotation),
         symmetry=torch.from_numpy(symmetry.astype(np.int64)),
         score=torch.from_numpy(score),
+        classes=classes,
     )
 
 

@@ -17,7 +17,7 @@ from viser.transforms import SO3
 
 from raytran.data.views import choose_even
 from raytran.pictures.wireframe import box_corners, box_edges
-from raytran.structs import CLASS_COLORS, CLASSES, ObjectSet
+from raytran.structs import ObjectSet
 from raytran.viewer.attention import ReadPixels
 from raytran.viewer.data import ViewerScene, VoxelVolume
 from raytran.viewer.truth import ObjectError
@@ -147,8 +147,9 @@ class SceneNodes:
 
     def mark_object(self, index: int | None) -> None:
         """Draw the edges of one object's box black, or of none."""
+        colors = self._scene.objects.classes.colors
         for i, nodes in enumerate(self.objects):
-            color = (0, 0, 0) if i == index else CLASS_COLORS[int(self._scene.objects.label[i])]
+            color = (0, 0, 0) if i == index else colors[int(self._scene.objects.label[i])]
             nodes.edges.colors = nodes.front.colors = np.array(color, dtype=np.uint8)
 
     def mark_frame(self, index: int) -> None:
@@ -239,7 +240,8 @@ class SceneNodes:
         add, objects = self._server.scene, self._scene.objects
         label = int(objects.label[index])
         # In a file the tree of nodes is the only filter, so classes stand in it.
-        path, color = f"/objects/{CLASSES[label]}/{index:02d}", CLASS_COLORS[label]
+        path = f"/objects/{objects.classes.names[label]}/{index:02d}"
+        color = objects.classes.colors[label]
         solid: Any
         if mesh is None:
             size = tuple(objects.size[index].tolist())
@@ -282,17 +284,17 @@ class SceneNodes:
     def _add_truth(self) -> list[viser.LineSegmentsHandle]:
         if self._scene.truth is None:
             return []
-        nodes = []
+        nodes, classes = [], self._scene.truth.classes
         # Of 2n + 1 equal parts of an edge every other one is drawn.
         along = np.linspace(0, 1, 2 * _DASHES)[:, None]
         for i, corners in enumerate(box_corners(self._scene.truth).double().numpy()):
             start, stop = corners[box_edges()[0].numpy()].swapaxes(0, 1)[:, :, None]
             dashes = (start + along * (stop - start)).reshape(-1, 2, 3)
             label = int(self._scene.truth.label[i])
-            name = f"/truth/{CLASSES[label]}/{i:02d}"
+            name = f"/truth/{classes.names[label]}/{i:02d}"
             nodes.append(
                 self._server.scene.add_line_segments(
-                    name, dashes, CLASS_COLORS[label], thickness=2.0, thickness_units="screen"
+                    name, dashes, classes.colors[label], thickness=2.0, thickness_units="screen"
                 )
             )
         return nodes
@@ -346,7 +348,7 @@ class SceneNodes:
 
 def object_name(scene: ViewerScene, index: int) -> str:
     """Return an object's class and score."""
-    return f"{CLASSES[int(scene.objects.label[index])]} {float(scene.objects.score[index]):.2f}"
+    return f"{scene.objects.category[index]} {float(scene.objects.score[index]):.2f}"
 
 
 def describe_error(error: ObjectError) -> str:

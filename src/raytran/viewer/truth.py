@@ -8,6 +8,7 @@ from pathlib import Path
 
 import torch
 
+from raytran.classes import PAPER_CLASSES, Classes
 from raytran.data.scan2cad import read_annotations, scene_objects
 from raytran.errors import DataError
 from raytran.export import FORMAT, read_scene_json
@@ -75,12 +76,13 @@ def object_errors(predictions: ObjectSet, truth: ObjectSet) -> list[ObjectError 
     ]
 
 
-def read_truth(path: Path, scene_id: str) -> ObjectSet:
+def read_truth(path: Path, scene_id: str, classes: Classes = PAPER_CLASSES) -> ObjectSet:
     """Read the true objects of one scene.
 
     Args:
         path: Scan2CAD's ``full_annotations.json``, or a file in the form of ``scene.json``.
         scene_id: name of the scene, by which it is found in the former.
+        classes: that the objects are of; objects of no class are left out.
 
     Raises:
         DataError: the file cannot be read, is of neither form, or does not have the scene.
@@ -91,11 +93,11 @@ def read_truth(path: Path, scene_id: str) -> ObjectSet:
     except OSError as error:
         raise DataError(f"cannot read truth={path} ({error.strerror}): check the path") from error
     if FORMAT in beginning:
-        return read_scene_json(path).objects
+        return read_scene_json(path, classes).objects
     annotations = read_annotations(path)
     if scene_id not in annotations:
         raise DataError(f"{path} has no scene {scene_id}: give the annotations of this scene as truth=")
-    return scene_objects(annotations[scene_id])
+    return scene_objects(annotations[scene_id], classes)
 
 
 def _double(objects: ObjectSet) -> ObjectSet:

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from raytran.classes import PAPER_CLASSES, SCAN2CAD_CLASS_BY_CATID
 from raytran.data.shapenet.models import model_folder, read_mesh
 from raytran.errors import DataError
 from raytran.rooms.kinds import KINDS
 from raytran.rooms.sweethome3d import import_furniture
 from raytran.rooms.sweethome3d.furniture import HELD_OUT, read_table
-from raytran.structs import CLASS_BY_CATID, CLASSES
 
 from ...factories import digests
 
@@ -228,11 +228,11 @@ def test_what_is_no_library_is_refused(tmp_path, write_library, entry):
 def test_table_agrees_with_the_kinds():
     table = read_table()
     assert len(table) >= 230
-    assert {row.category for row in table.values()} == set(CLASSES)
+    assert {row.category for row in table.values()} == set(PAPER_CLASSES.names)
     for row in table.values():
         kind = KINDS[row.kind]
         assert kind.category == row.category, row.piece
-        assert CLASS_BY_CATID.get(kind.catid, "other") == row.category
+        assert SCAN2CAD_CLASS_BY_CATID.get(kind.catid, "other") == row.category
         assert row.turn_deg in (0, 90, 180, 270)
 
 
@@ -255,7 +255,7 @@ def test_both_splits_hold_every_class():
         (row.piece.startswith(("Blend Swap CC-BY#", "Kator Legaz#")), row.category)
         for row in read_table().values()
     )
-    assert {(held_out, name) for held_out in (False, True) for name in CLASSES} <= set(rows)
+    assert {(held_out, name) for held_out in (False, True) for name in PAPER_CLASSES.names} <= set(rows)
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate name")

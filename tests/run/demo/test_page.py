@@ -9,10 +9,11 @@ from html.parser import HTMLParser
 import pytest
 import torch
 
+from raytran.classes import PAPER_CLASSES
 from raytran.run.demo.page import ShownScene, headline, write_page
 from raytran.run.predict.write_scene import PredictedScene, write_scene
 from raytran.run.train.fit import FitResult
-from raytran.structs import CLASSES, ObjectSet, SceneBatch, ScenePrediction, Views
+from raytran.structs import ObjectSet, SceneBatch, ScenePrediction, Views
 
 UPRIGHT = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
@@ -44,7 +45,7 @@ class Page(HTMLParser):
 
 def metrics(n_good: int) -> dict:
     counts = {"n_good": 0, "n_total": 0, "accuracy": 0.0}
-    per_class = {name: dict(counts) for name in CLASSES}
+    per_class = {name: dict(counts) for name in PAPER_CLASSES.names}
     per_class["chair"] = {"n_good": n_good, "n_total": 5, "accuracy": n_good / 5}
     total = {
         "n_good": n_good,

@@ -12,6 +12,7 @@ import pytest
 import torch
 import trimesh
 
+from raytran.classes import PAPER_CLASSES
 from raytran.data.files import disk_full
 from raytran.data.shapenet.voxelize import voxelize_solid
 from raytran.export.read import read_alignments_csv, read_predictions
@@ -20,7 +21,7 @@ from raytran.postprocess import object_meshes
 from raytran.rooms.cad import CadModel, sample_model
 from raytran.rooms.shapenet_files import write_model
 from raytran.run.predict.write_scene import PredictedScene, write_scene
-from raytran.structs import CLASSES, ObjectSet, ScenePrediction, Views
+from raytran.structs import ObjectSet, ScenePrediction, Views
 
 from ...factories import digests
 
@@ -37,7 +38,7 @@ def found(chair) -> PredictedScene:
     """A chair, and a table whose shape is empty."""
     shape = torch.from_numpy(voxelize_solid(chair.vertices, chair.faces, size=15)).float()
     objects = ObjectSet(
-        label=torch.tensor([CLASSES.index("chair"), CLASSES.index("table")]),
+        label=torch.tensor([PAPER_CLASSES.index("chair"), PAPER_CLASSES.index("table")]),
         center=torch.tensor([[0.0, 2.0, 0.5], [1.0, 2.5, 0.4]]),
         size=torch.tensor([chair.size_m.tolist(), [1.0, 0.8, 0.6]]).float(),
         rotation=rotation_from_yaw(torch.tensor([0.5, 0.0])),

@@ -32,7 +32,7 @@ from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
 from raytran.pictures.overlay import draw_objects
 from raytran.pictures.page import data_uri, write_page
-from raytran.pictures.palette import FAINT, INK, class_hex
+from raytran.pictures.palette import FAINT, INK
 from raytran.pictures.wireframe import NEAR, box_corners
 
 _SHOWN_FRAMES = 3
@@ -274,8 +274,9 @@ def _draw_panel(
         extremes.append(corners.reshape(-1, 2))
         for points, label in zip(corners, examination.objects.label.tolist(), strict=True):
             outline = points[ConvexHull(points, qhull_options="QJ").vertices]
-            axes.add_patch(Polygon(outline, facecolor=class_hex(label), alpha=0.35, zorder=3))
-            axes.add_patch(Polygon(outline, fill=False, edgecolor=class_hex(label), linewidth=1.4, zorder=4))
+            color = examination.objects.classes.hex(label)
+            axes.add_patch(Polygon(outline, facecolor=color, alpha=0.35, zorder=3))
+            axes.add_patch(Polygon(outline, fill=False, edgecolor=color, linewidth=1.4, zorder=4))
     if len(cameras.points):
         extremes.append(np.percentile(cameras.points[:, pair], [1, 99], axis=0))
     low, high = np.concatenate(extremes).min(axis=0), np.concatenate(extremes).max(axis=0)

@@ -13,12 +13,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from raytran.classes import PAPER_CLASSES
 from raytran.data.files import bytes_below
 from raytran.data.prepare.annotation import Annotations, Entry, LeftOut
 from raytran.data.prepare.scan import read_facts
 from raytran.data.prepare.sources import Sources
 from raytran.data.scan2cad import SceneAnnotation, parse_entry, scene_objects
-from raytran.structs import CLASSES, ObjectSet
+from raytran.structs import ObjectSet
 
 PAPER_SCENES = {"train": 1194, "val": 306}
 """Annotated scans of RayTran §4."""
@@ -126,7 +127,7 @@ def _objects_by_class(
     table = {}
     for split, scans in membership.items():
         labels = Counter(label for scan in scans if scan in objects for label in objects[scan].label.tolist())
-        table[split] = {name: labels[index] for index, name in enumerate(CLASSES)}
+        table[split] = {name: labels[index] for index, name in enumerate(PAPER_CLASSES.names)}
     return table
 
 
@@ -210,7 +211,7 @@ def class_table(objects: Mapping[str, Mapping[str, int]]) -> Iterable[str]:
     """Return a table: a row for each class, a column for each split, and the paper's validation scans."""
     columns = dict(objects) | ({"val, paper": PAPER_VAL_OBJECTS} if "val" in objects else {})
     yield "Objects  " + " " * 11 + "".join(f"{name:>12}" for name in columns)
-    for name in CLASSES:
+    for name in PAPER_CLASSES.names:
         yield f"         {name:<11}" + "".join(f"{column.get(name, '–'):>12}" for column in columns.values())
     yield f"         {'all':<11}" + "".join(f"{sum(column.values()):>12}" for column in columns.values())
 

@@ -8,10 +8,11 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
+from raytran.classes import SCAN2CAD_CLASS_BY_CATID
 from raytran.errors import ShapeError
 from raytran.geometry.rotation import matrix_from_quaternion
 from raytran.metrics.functional.alignment import row_blocks
-from raytran.structs import CLASS_BY_CATID, CadAlignments
+from raytran.structs import CadAlignments
 
 _SMALLEST_SCALE = 1e-3
 
@@ -94,7 +95,7 @@ def bev_iou(first: Tensor, second: Tensor) -> Tensor:
 
 
 def _named(alignments: CadAlignments) -> Tensor:
-    return torch.tensor([catid in CLASS_BY_CATID for catid in alignments.catid], dtype=torch.bool)
+    return torch.tensor([catid in SCAN2CAD_CLASS_BY_CATID for catid in alignments.catid], dtype=torch.bool)
 
 
 def _corners(linear: Tensor, translation: Tensor, half: Tensor) -> Tensor:

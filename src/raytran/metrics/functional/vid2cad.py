@@ -9,6 +9,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from raytran.classes import SCAN2CAD_CLASS_BY_CATID
 from raytran.errors import ShapeError
 from raytran.metrics.functional.alignment import AlignmentErrors, row_blocks
 from raytran.metrics.functional.cad_errors import (
@@ -20,9 +21,9 @@ from raytran.metrics.functional.cad_errors import (
     shift_error,
 )
 from raytran.metrics.functional.detection import match_in_order
-from raytran.structs import CLASS_BY_CATID, CadAlignments
+from raytran.structs import CadAlignments
 
-VID2CAD_CLASS_BY_CATID: dict[str, str] = {**CLASS_BY_CATID, "02818832": "bed"}
+VID2CAD_CLASS_BY_CATID: dict[str, str] = {**SCAN2CAD_CLASS_BY_CATID, "02818832": "bed"}
 """The nine classes of the script: bed instead of ``other``."""
 
 _DUPLICATE_LIMITS = (0.4, 60.0, 0.6)

@@ -16,10 +16,10 @@ from raytran.data.images import decode_image
 from raytran.pictures.curves import draw_curves
 from raytran.pictures.page import data_uri
 from raytran.pictures.page import write_page as fill_template
-from raytran.pictures.palette import class_hex
+from raytran.pictures.palette import INK
 from raytran.pictures.panels import contact_sheet, draw_frames, draw_masks, draw_occupancy
 from raytran.run.train.fit import FitResult
-from raytran.structs import CLASSES, SceneBatch, ScenePrediction
+from raytran.structs import SceneBatch, ScenePrediction
 from raytran.training.loggers import read_history
 
 COLUMNS = {
@@ -89,7 +89,13 @@ def write_page(
     """
     (output / "pictures").mkdir(parents=True, exist_ok=True)
     splits = [_split(column, metrics) for column in metrics]
-    classes = [name for name in CLASSES if any(name in split["per_class"] for split in splits)]
+    colors = {
+        name: of_scene.hex(label)
+        for of_scene in (scene.prediction.objects.classes for scene in scenes)
+        for label, name in enumerate(of_scene.names)
+    }
+    present = dict.fromkeys([*colors, *(name for split in splits for name in split["per_class"])])
+    classes = [name for name in present if any(name in split["per_class"] for split in splits)]
     found = provenance()
     commit = {"commit": found["git_commit"]} if found["git_commit"] else {}
     files = _files(output, scenes, fits)
@@ -104,7 +110,7 @@ def write_page(
         "frames alone.",
         splits=splits,
         sections=[*(_room(scene, output / "pictures") for scene in scenes), _training(output, fits)],
-        classes=[(name, class_hex(CLASSES.index(name))) for name in classes],
+        classes=[(name, colors.get(name, INK)) for name in classes],
         seconds=seconds,
         files={name: os.path.relpath(path, output) for name, path in files.items()},
         versions={**found["versions"], **commit, "platform": found["platform"]},

@@ -12,7 +12,7 @@ from typing import Any, cast
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.progress import track
 from torch.utils.data import Dataset, Subset
@@ -20,6 +20,7 @@ from torchmetrics import Metric
 
 from raytran.checkpoints.load import PredictionSettings, load_model, prediction_settings
 from raytran.checkpoints.network import trusted_packages
+from raytran.classes import Classes
 from raytran.data.views import RepeatedFrames
 from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
@@ -30,7 +31,7 @@ from raytran.run.entry import compose, typed_settings
 from raytran.run.evaluate.results import MARKER, Evaluation, read_curves, result_tables, write_evaluation
 from raytran.run.evaluate.score import ProtocolScores, confidence, evaluate_predictions
 from raytran.run.output import one_writer
-from raytran.run.train.build import build_data
+from raytran.run.train.build import build_data, plain
 from raytran.structs import SceneBatch
 from raytran.training.datamodule import SceneDataModule
 from raytran.training.scores import SceneScores
@@ -86,6 +87,7 @@ def _of_files(cfg: DictConfig) -> tuple[Evaluation, str]:
         volume_extent=list(cfg.volume_extent),
         num_resamples=cfg.num_resamples,
         seed=cfg.seed,
+        classes=Classes.of(plain(cfg.classes)),
     )
     return evaluation, str(cfg.predictions)
 
@@ -98,7 +100,9 @@ def _of_checkpoint(cfg: DictConfig) -> tuple[Evaluation, str]:
     model = load_model(cfg.checkpoint, attention=cfg.attention, trust=trusted_packages(cfg.trust)).to(device)
     tasks = TASKS_OF_STAGE.get(settings.stage, TASKS)
     # The checkpoint says of which preset it is and which data it wants: composed again with that.
+    classes = _classes_of_checkpoint(cfg, model)
     cfg = compose("evaluate", _overrides_of_checkpoint(cfg, settings, model, tasks))
+    OmegaConf.update(cfg, "classes", classes.settings(), merge=False)
     split = cfg.split or "val"
     data = build_data(cfg)
     data.prepare_data()
@@ -116,6 +120,30 @@ def _of_checkpoint(cfg: DictConfig) -> tuple[Evaluation, str]:
         | {"checkpoint": str(cfg.checkpoint), "max_objects": cfg.max_objects},
     )
     return evaluation, f"{settings.preset}, {split} scenes of {data.root}, {cfg.views.num_views} frames each"
+
+
+def _classes_of_checkpoint(cfg: DictConfig, model: RayTran) -> Classes:
+    """Return the network's classes, with the colours and categories that were typed.
+
+    Raises:
+        ConfigError: other names were typed, or something that is none.
+    """
+    typed = [item.lstrip("+") for item in typed_settings(HydraConfig.get())]
+    given: dict[str, Any] = plain(cfg.classes)
+    is_group = any(item.startswith("classes=") for item in typed)
+    chosen = {
+        name: value
+        for name, value in given.items()
+        if is_group or any(item.startswith(f"classes.{name}=") for item in typed)
+    }
+    classes = Classes.of(model.classes.settings() | chosen)
+    difference = classes.difference(model.classes)
+    if difference is not None:
+        raise ConfigError(
+            f"the network of {cfg.checkpoint} has {difference}, which are others than those given: leave "
+            "classes out, they come from the checkpoint"
+        )
+    return classes
 
 
 def _overrides_of_checkpoint(
@@ -211,6 +239,7 @@ def evaluate_model(
         duplicate_iou=duplicate_iou,
         volume_extent=model.grid_extent,
         metrics=metrics,
+        classes=model.classes,
     ).to(device)
     model.eval()
     forward_tasks = [task for task in tasks if task != "shape"]  # shapes are decoded of chosen objects alone

@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from raytran.data.scan2cad import SceneAnnotation, read_annotations, scene_alignments, scene_objects
+from raytran.classes import PAPER_CLASSES, Classes
+from raytran.data.scan2cad import SceneAnnotation, read_annotations, scene_alignments
 from raytran.data.scannet.scan import read_scan
+from raytran.data.scene_list import annotated_objects
 from raytran.data.text import read_names
 from raytran.errors import ConfigError, DataError
 from raytran.export.read import CadBoxes, PredictionFiles, read_predictions
@@ -31,7 +33,7 @@ from raytran.metrics.bootstrap import (
 )
 from raytran.metrics.box_f1 import OrientedBoxF1
 from raytran.metrics.functional.cad_errors import cad_symmetries
-from raytran.metrics.per_scene import Row
+from raytran.metrics.per_scene import Row, check_protocol_classes
 from raytran.metrics.scan2cad import Scan2CADAccuracy
 from raytran.metrics.strict import StrictScores, side_by_side
 from raytran.run.evaluate.results import PROTOCOLS, Evaluation
@@ -70,6 +72,7 @@ class Truth:
     alignments: dict[str, CadAlignments]
     cad_boxes: CadBoxes
     volume_center: dict[str, Tensor]
+    classes: Classes = PAPER_CLASSES
 
 
 def evaluate_predictions(
@@ -83,6 +86,7 @@ def evaluate_predictions(
     volume_extent: Sequence[float] | None = None,
     num_resamples: int = 2000,
     seed: int = 0,
+    classes: Classes = PAPER_CLASSES,
 ) -> Evaluation:
     """Score the predictions for many scenes.
 
@@ -96,6 +100,7 @@ def evaluate_predictions(
         volume_extent: size of that grid, metres.
         num_resamples: draws of the bootstrap.
         seed: of the bootstrap.
+        classes: that objects are of, for protocol ``strict``; the others have their own.
 
     Returns:
         by protocol what its metric returns and ``confidence`` intervals; ``comparison`` by protocol.
@@ -104,7 +109,7 @@ def evaluate_predictions(
         ConfigError: the protocol is unknown or does not fit the predictions.
         DataError: a file is missing or damaged.
     """
-    truth = read_truth(annotations, split=split, scans=scans)
+    truth = read_truth(annotations, split=split, scans=scans, classes=classes)
     files, scores = _scores_by_protocol(protocol, predictions, truth, volume_extent)
     paths = {"predictions": predictions, "annotations": annotations, "split": split}
     metrics: dict[str, Any] = {name: None if path is None else str(path) for name, path in paths.items()}
@@ -136,20 +141,27 @@ def evaluate_predictions(
 def _scores_by_protocol(
     protocol: str, path: Path, truth: Truth, volume_extent: Sequence[float] | None = None
 ) -> tuple[PredictionFiles, dict[str, ProtocolScores]]:
-    files = read_predictions(path, truth.objects, truth.cad_boxes)
-    protocols = choose_protocols(protocol, files, path)
+    files = read_predictions(path, truth.objects, truth.cad_boxes, truth.classes)
+    protocols = choose_protocols(protocol, files, path, truth.classes)
     return files, {
         name: score_protocol(name, files, truth, volume_extent=volume_extent) for name in protocols
     }
 
 
-def read_truth(annotations: Path, *, split: Path | None = None, scans: Path | None = None) -> Truth:
+def read_truth(
+    annotations: Path,
+    *,
+    split: Path | None = None,
+    scans: Path | None = None,
+    classes: Classes = PAPER_CLASSES,
+) -> Truth:
     """Read the annotated scenes.
 
     Args:
         annotations: Scan2CAD's ``full_annotations.json``.
         split: text file of scene names, one a line; None: all scenes of the annotations.
         scans: folder of ScanNet scans, whose cameras tell where each voxel grid was; None: unknown.
+        classes: that objects are of; others are no ``objects``.
 
     Raises:
         DataError: a file is missing or damaged, or no scene of the split is annotated.
@@ -158,7 +170,7 @@ def read_truth(annotations: Path, *, split: Path | None = None, scans: Path | No
     chosen = _of_split(scenes, split, annotations)
     centers = {} if scans is None else {name: _volume_center(scans / name) for name in chosen}
     return Truth(
-        objects={name: scene_objects(scene) for name, scene in chosen.items()},
+        objects=dict(zip(chosen, annotated_objects(chosen, list(chosen), classes), strict=True)),
         alignments={name: scene_alignments(scene) for name, scene in chosen.items()},
         cad_boxes={
             name: (center, half)
@@ -166,6 +178,7 @@ def read_truth(annotations: Path, *, split: Path | None = None, scans: Path | No
             for name, center, half in zip(scene.model_id, scene.box_center, scene.box_half_size, strict=True)
         },
         volume_center=centers,
+        classes=classes,
     )
 
 
@@ -186,15 +199,22 @@ def _volume_center(scan: Path) -> Tensor:
     return read_scan(scan).world_from_camera[:, :3, 3].mean(dim=0)
 
 
-def choose_protocols(protocol: str, files: PredictionFiles, path: Path) -> tuple[str, ...]:
+def choose_protocols(
+    protocol: str, files: PredictionFiles, path: Path, classes: Classes = PAPER_CLASSES
+) -> tuple[str, ...]:
     """Return the protocols to follow.
 
     Raises:
-        ConfigError: the protocol is unknown, or compares CAD models, which the predictions do not name.
+        ConfigError: the protocol is unknown, is defined on other classes, or compares CAD models, which the
+            predictions do not name.
     """
     if protocol not in (*PROTOCOLS, ALL_PROTOCOLS):
         known = ", ".join((*PROTOCOLS, ALL_PROTOCOLS))
         raise ConfigError(f"unknown protocol={protocol}, choose one of: {known}")
+    if classes.names != PAPER_CLASSES.names:
+        if protocol not in ("strict", ALL_PROTOCOLS):
+            check_protocol_classes(protocol, classes)
+        return ("strict",)
     without = [scene.path for scene in files.scenes.values() if scene.cads is None]
     possible = tuple(name for name in PROTOCOLS if not (without and name in _NEEDS_CADS))
     if protocol == ALL_PROTOCOLS:
@@ -249,7 +269,7 @@ def _score_strict(
         )
     predicted = {name: scene.objects for name, scene in files.scenes.items()}
     predictions = [predicted.get(name, ObjectSet.empty()) for name in names]
-    scores = StrictScores(volume_extent=volume_extent)
+    scores = StrictScores(volume_extent=volume_extent, classes=truth.classes)
     scores.update(predictions, targets, names, [truth.volume_center.get(name) for name in names])
     return ProtocolScores(
         scores.compute(),

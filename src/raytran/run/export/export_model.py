@@ -14,15 +14,15 @@ from rich.markup import escape
 from rich.table import Table
 
 from raytran.checkpoints.file import PREFIX, SUFFIX, checkpoint_path, export_weights, read_checkpoint
-from raytran.checkpoints.load import model_from, prediction_settings
+from raytran.checkpoints.load import classes_of, model_from, prediction_settings
 from raytran.checkpoints.metadata import DataIdentity
 from raytran.checkpoints.network import trusted_packages
+from raytran.classes import Classes
 from raytran.errors import ConfigError
 from raytran.export.torch_program import SUFFIX as PROGRAM_SUFFIX
 from raytran.export.torch_program import export_program
 from raytran.run.plan.camera_paths import walk
 from raytran.run.train.build import plain
-from raytran.structs import CLASSES
 
 _log = logging.getLogger(__name__)
 
@@ -67,7 +67,7 @@ def described(checkpoint: Mapping[str, Any], path: Path) -> Table:
         {str(value.dtype).removeprefix("torch.") for value in weights if value.is_floating_point()}
     )
     views, versions = checkpoint["views"], checkpoint.get("versions") or {}
-    parent = checkpoint.get("parent") or {}
+    parent, classes = checkpoint.get("parent") or {}, classes_of(checkpoint)
     rows = {
         "size": f"{path.stat().st_size / 1e6:.1f} MB",
         "preset": checkpoint["preset"],
@@ -75,13 +75,18 @@ def described(checkpoint: Mapping[str, Any], path: Path) -> Table:
         "steps": checkpoint.get("global_step"),
         "parent": f"{parent['stage']}, {parent['step']} steps" if parent else None,
         "trained on": str(known) if (known := DataIdentity.of_checkpoint(checkpoint)) else None,
+        "classes": str(classes),
         "weights": f"{sum(value.numel() for value in weights) / 1e6:.2f} M, {', '.join(dtypes)}",
         "images": f"{views.get('image_size')}, {views.get('predict_views')} a scene",
         "raytran": versions.get("raytran"),
         "commit": checkpoint.get("git_commit"),
         "torch": versions.get("torch"),
         "WARNING": "; ".join(checkpoint.get("warnings") or ()) or None,
-        **{name: score for name, score in (checkpoint.get("scores") or {}).items() if _is_summary(name)},
+        **{
+            name: score
+            for name, score in (checkpoint.get("scores") or {}).items()
+            if _is_summary(name, classes)
+        },
     }
     # What a file says may look like Rich's markup.
     table = Table("", "", title=escape(str(path)), show_header=False)
@@ -92,10 +97,10 @@ def described(checkpoint: Mapping[str, Any], path: Path) -> Table:
     return table
 
 
-def _is_summary(name: str) -> bool:
+def _is_summary(name: str, classes: Classes) -> bool:
     """Say whether a score is neither of one class nor of what precedes the last layer."""
     last = name.rpartition("/")[2]
-    return last not in CLASSES and last != "proposals" and not last.startswith("layer")
+    return last not in classes.names and last != "proposals" and not last.startswith("layer")
 
 
 def _check_output(source: Path, output: Path) -> None:

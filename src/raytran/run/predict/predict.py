@@ -87,7 +87,7 @@ def _predict(
     _check_channels(model, cfg.checkpoint)
     new_cameras = cameras_to_render(cfg.views, model, cfg.checkpoint)
     scene_id = recording.stem if recording.is_file() else recording.name
-    truth = read_truth(Path(cfg.truth), scene_id) if cfg.truth else None
+    truth = read_truth(Path(cfg.truth), scene_id, model.classes) if cfg.truth else None
     room = _read_room(cfg, world, intrinsics, settings, model)
     scene = predict_scene(
         model,

@@ -19,9 +19,10 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from raytran.checkpoints.file import read_checkpoint, read_newest
-from raytran.checkpoints.load import load_weights
+from raytran.checkpoints.load import classes_of, load_weights
 from raytran.checkpoints.metadata import DataIdentity, checkpoint_metadata, provenance
 from raytran.checkpoints.runs import FINISHED, LAST, one_at_a_time, read_finished, write_finished
+from raytran.classes import Classes
 from raytran.data.files import write_json, write_text
 from raytran.errors import CheckpointError, ConfigError
 from raytran.run.device import cudnn_warning, set_matmul_precision
@@ -228,6 +229,12 @@ def _resumed_module(cfg: DictConfig, stage: Stage, path: Path, content: dict[str
         raise CheckpointError(
             f"{path} is of {content['stage']}, not {stage.name}: choose the experiment "
             f"that wrote it, or start a new run from its weights with init_from={path}"
+        )
+    difference = Classes.of(plain(cfg.classes)).difference(classes_of(content))
+    if difference is not None:
+        raise CheckpointError(
+            f"{path} has {difference}: give the classes that the run began with, or start a new run from its "
+            f"weights with init_from={path}"
         )
     module = build_module(cfg, build_model(cfg, pretrained=False))
     load_weights(module.model, content, path)

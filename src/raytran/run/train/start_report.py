@@ -8,6 +8,7 @@ from typing import Any
 
 from raytran.checkpoints.metadata import DataIdentity
 from raytran.checkpoints.network import own_packages
+from raytran.classes import PAPER_CLASSES
 from raytran.model import RayTran
 from raytran.training.stage import Stage
 
@@ -26,6 +27,13 @@ _BEFORE_THEY_WERE_KEYS = {
     "loss.matcher.center_beta": 0.1,
     "loss.matcher.yaw_beta": 0.1,
     "data.dataset.object_choice": "all",
+    **{
+        f"{where}.{name}": value
+        for where in ("classes", "model.classes", "data.dataset.classes")
+        for name, value in (("names", list(PAPER_CLASSES.names)), ("colors", None), ("catids", None))
+    },
+    "model.heads.objects.classes": list(PAPER_CLASSES.names),
+    "model.heads.objects.queries.classes": list(PAPER_CLASSES.names),
 }
 """What runs did whose checkpoints do not have these settings yet."""
 

@@ -12,11 +12,12 @@ from typing import Any
 import lightning.pytorch as pl
 from torch import nn
 
-from raytran.checkpoints.load import fresh_parts, load_weights
+from raytran.checkpoints.load import classes_of, fresh_parts, load_weights
 from raytran.checkpoints.metadata import DataIdentity
 from raytran.errors import CheckpointError
+from raytran.model import RayTran
 from raytran.training.lightning_module import Reconstruction
-from raytran.training.stage import Stage
+from raytran.training.stage import Stage, is_within
 
 _log = logging.getLogger(__name__)
 
@@ -78,9 +79,20 @@ class StageCallback(pl.Callback):
         pl_module.stage.freeze(pl_module.model)
 
     def _take_weights(self, module: Reconstruction, path: Path, content: Mapping[str, Any]) -> None:
-        fresh = fresh_parts(module.model, content, module.stage.fresh_parts)
+        model, stage = module.model, module.stage
+        fresh = fresh_parts(model, content, stage.fresh_parts)
+        of_classes = set(model.class_layers())
         for part in fresh:
-            _log.info("%s starts at random: its parent has none that fits, and trained none", part)
+            if part not in of_classes:
+                _log.info("%s starts at random: its parent has none that fits, and trained none", part)
+        difference = model.classes.difference(classes_of(content))
+        if difference is not None:
+            check_class_layers(model, stage, path, difference)
+            _log.info(
+                "what tells the %d classes apart starts at random: its parent has %s",
+                len(model.classes),
+                difference,
+            )
         load_weights(module.model, content, path, fresh=fresh)
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
@@ -159,6 +171,26 @@ class Parent:
     def as_plain(self) -> dict[str, Any]:
         """Return plain Python, to be written into a checkpoint."""
         return asdict(self)
+
+
+def check_class_layers(model: RayTran, stage: Stage, path: Path, difference: str) -> None:
+    """Raise if a stage needs what tells classes apart, but would neither get it from its parent nor train it.
+
+    Args:
+        model: the network.
+        stage: the stage to train.
+        path: the parent.
+        difference: how its classes differ, see ``Classes.difference``.
+
+    Raises:
+        CheckpointError: it would not.
+    """
+    untrained = [layer for layer in model.class_layers() if not is_within(layer, stage.trainable)]
+    if untrained and "objects" in stage.tasks:
+        raise CheckpointError(
+            f"{path} has {difference}, and {stage.name} does not train what tells classes apart: "
+            f"train experiment={stage.parent_experiment} with these classes first"
+        )
 
 
 def check_parent(parent: Parent, stage: Stage, check: str) -> None:
