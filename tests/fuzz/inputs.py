@@ -11,7 +11,7 @@ import shutil
 import zipfile
 import zlib
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,6 +30,7 @@ from raytran.checkpoints.file import PREFIX, write_checkpoint, write_weights
 from raytran.checkpoints.load import load_model, prediction_settings
 from raytran.checkpoints.metadata import checkpoint_metadata
 from raytran.checkpoints.runs import read_finished
+from raytran.classes import Classes
 from raytran.data.cache import MaskCache
 from raytran.data.files import SettingsRecord
 from raytran.data.prepare.annotation import read_usable
@@ -563,6 +564,9 @@ def read_evaluation(folder: Path) -> None:
 def read_result(folder: Path) -> None:
     scene = read_viewer_scene(folder)
     check_objects(scene.objects)
+    for objects in (scene.objects, scene.truth):
+        if objects is not None:
+            within(objects.label, 0, len(objects.classes) - 1, "labels")
     within(scene.cameras.world_from_camera, -1e6, 1e6, "poses")
     within(scene.cameras.intrinsics, -1e7, 1e7, "intrinsics")
     for volume in scene.volumes:
@@ -577,7 +581,7 @@ def read_result(folder: Path) -> None:
 
 
 def make_result(folder: Path) -> None:
-    objects = make_objects()
+    objects = replace(make_objects(), classes=Classes(("drill", "lathe")))
     prediction = ScenePrediction("scene0000_00", objects, torch.zeros(3))
     meshes = [trimesh.creation.icosphere(subdivisions=1), None]
     write_prediction(folder, prediction, meshes)

@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from raytran.classes import PAPER_CLASSES
+from raytran.classes import PAPER_CLASSES, Classes
 from raytran.viewer.attention import ReadPixels
 from raytran.viewer.data import read_viewer_scene
 
@@ -67,6 +68,22 @@ def test_another_scene_takes_the_place_of_the_first(server, nodes, scene, tmp_pa
         "/objects/bathtub/00/mesh",
         "/objects/bookshelf/01/mesh",
     }
+
+
+def test_own_classes_name_and_colour_the_nodes(server, scene):
+    classes = Classes(tuple(f"machine {i}" for i in range(9)), colors=tuple((i, i, i) for i in range(9)))
+    own = replace(
+        scene,
+        objects=replace(scene.objects, classes=classes),
+        truth=replace(scene.truth, classes=classes),
+    )
+    nodes = SceneNodes(server, own)
+    assert {"/objects/machine 3/03/mesh", "/truth/machine 5/05"} <= names(server)
+    assert nodes.objects[3].solid.color == (3, 3, 3)
+    assert nodes.objects[3].name.text.startswith("machine 3 0.")
+    nodes.mark_object(0)
+    nodes.mark_object(None)
+    assert nodes.objects[2].edges.colors.tolist() == [2, 2, 2]
 
 
 def test_boxes_are_where_the_objects_are(nodes, scene):

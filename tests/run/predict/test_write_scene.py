@@ -5,16 +5,21 @@ from __future__ import annotations
 
 import json
 import resource
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from matplotlib.figure import Figure
+from matplotlib.text import Text
+from PIL import ImageDraw
 
-from raytran.classes import PAPER_CLASSES
+from raytran.classes import PAPER_CLASSES, Classes
 from raytran.data.files import disk_full
 from raytran.data.shapenet.voxelize import voxelize_solid
+from raytran.errors import DataError
 from raytran.export.read import read_alignments_csv, read_predictions
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.postprocess import object_meshes
@@ -22,6 +27,7 @@ from raytran.rooms.cad import CadModel, sample_model
 from raytran.rooms.shapenet_files import write_model
 from raytran.run.predict.write_scene import PredictedScene, write_scene
 from raytran.structs import ObjectSet, ScenePrediction, Views
+from raytran.viewer.data import read_viewer_scene
 
 from ...factories import digests
 
@@ -92,6 +98,57 @@ def test_on_a_full_disk_the_folder_is_whole_or_as_it_was(tmp_path, found, views)
 def test_the_turntable_is_there_if_wanted(tmp_path, found, views):
     assert write(tmp_path / "still", found, views) == FILES
     assert write(tmp_path / "turning", found, views, turntable=1) == FILES | {"turntable.gif"}
+
+
+def test_every_file_has_the_names_and_colours_of_own_classes(tmp_path, found, views, monkeypatch):
+    classes = Classes(("drill press", "Säge", "bench"), colors=((10, 200, 30), (1, 2, 3), (4, 5, 6)))
+    label = torch.tensor([0, 2])
+    truth = replace(found.prediction.objects, label=label, classes=classes, shape=None)
+    prediction = replace(
+        found.prediction, objects=replace(found.prediction.objects, label=label, classes=classes)
+    )
+    written = []
+    draw = ImageDraw.ImageDraw.text
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", lambda *a, **k: (written.append(a[2]), draw(*a, **k))[1])
+    save = Figure.savefig
+    monkeypatch.setattr(
+        Figure,
+        "savefig",
+        lambda figure, *a, **k: (
+            written.extend(text.get_text() for text in figure.findobj(Text)),
+            save(figure, *a, **k),
+        ),
+    )
+    output = tmp_path / "room"
+    write_scene(
+        output,
+        PredictedScene(prediction, found.meshes, volumes=[]),
+        views,
+        ["0", "5"],
+        grid_extent=(4.0, 4.0, 2.0),
+        num_overlays=1,
+        turntable=1,
+        truth=truth,
+    )
+    # Over a frame, in the plan, and in its legend.
+    assert {"drill press 0.90", "00 drill press 0.90", "01 bench 0.60", "bench"} <= set(written)
+    content = json.loads((output / "scene.json").read_text())
+    assert [entry["category"] for entry in content["objects"]] == ["drill press", "bench"]
+    assert content["classes"] == classes.settings()
+    drawn = trimesh.load(output / "scene.glb")
+    assert set(drawn.graph.nodes_geometry) == {"00_drill press", "00_drill press_box", "01_bench_box"}
+    assert drawn.geometry["00_drill press"].visual.material.name == "drill press"
+    mesh = trimesh.load_mesh(output / "meshes/00.ply", process=False)
+    assert mesh.visual.vertex_colors[0].tolist() == [10, 200, 30, 255]
+    assert "newmtl drill press" in (output / "meshes/00.mtl").read_text()
+    shown = read_viewer_scene(output)
+    assert shown.objects.category == shown.truth.category == ("drill press", "bench")
+    assert shown.objects.classes == shown.truth.classes == classes
+    # Read for classes that it does not have, it says which object is of none of them.
+    with pytest.raises(DataError, match="category 'drill press': choose one of bathtub"):
+        read_predictions(output, ["room"], {})
+    read = read_predictions(output, ["room"], {}, classes)
+    assert read.scenes["room"].objects.category == ("drill press", "bench")
 
 
 def test_cad_models_are_named_placed_and_drawn(tmp_path, found, views, chair, caplog):

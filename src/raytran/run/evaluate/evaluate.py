@@ -136,14 +136,14 @@ def _classes_of_checkpoint(cfg: DictConfig, model: RayTran) -> Classes:
         for name, value in given.items()
         if is_group or any(item.startswith(f"classes.{name}=") for item in typed)
     }
-    classes = Classes.of(model.classes.settings() | chosen)
-    difference = classes.difference(model.classes)
+    names = Classes.of({"names": chosen.get("names", model.classes.names)})
+    difference = names.difference(model.classes)
     if difference is not None:
         raise ConfigError(
             f"the network of {cfg.checkpoint} has {difference}, which are others than those given: leave "
             "classes out, they come from the checkpoint"
         )
-    return classes
+    return Classes.of(model.classes.settings() | chosen)
 
 
 def _overrides_of_checkpoint(
