@@ -17,6 +17,7 @@ from raytran.checkpoints.network import (
     with_import_paths,
     with_registered_names,
 )
+from raytran.classes import PAPER_CLASSES
 from raytran.errors import CheckpointError, ConfigError
 from raytran.model import RayTran
 from raytran.run.entry import compose
@@ -125,6 +126,42 @@ def test_nothing_is_read_or_fetched(config, weights, monkeypatch):
 def test_settings_that_do_not_fit_are_one_sentence(config, place, value):
     with pytest.raises(CheckpointError, match=r"the network described in a\.ckpt cannot be built \("):
         build_network(changed(config, place, value), "a.ckpt")
+
+
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        *[
+            ("classes", value)
+            for value in ("chair", 9, ["chair"], {"names": 3}, {"names": ["a"] * 9}, {"x": 1})
+        ],
+        ("classes", {"names": ["chair"]}),  # the head has nine
+        ("classes", {"names": [f"c{i}" for i in range(9)], "colors": [[0, 0, 999]] * 9}),
+        ("classes", {"names": [f"c{i}" for i in range(9)], "catids": [["1"]] * 9}),
+        ("classes", {"names": [f"c{i}${{seed}}" for i in range(9)]}),
+        *[("heads.objects.classes", value) for value in (9, None, [], ["a"], "abc", ["a"] * 9_000)],
+        *[("heads.objects.queries.classes", value) for value in (9, None)],
+    ],
+)
+def test_classes_that_are_none_are_one_sentence(config, place, value):
+    with pytest.raises(
+        CheckpointError, match=r"the network described in a\.ckpt cannot be built \(|odd settings"
+    ):
+        build_network(changed(config, place, value), "a.ckpt", max_tensors=1000)
+
+
+def test_a_network_that_says_nothing_of_classes_has_the_papers(config):
+    earlier = copy.deepcopy(config)
+    del (
+        earlier["classes"],
+        earlier["heads"]["objects"]["classes"],
+        earlier["heads"]["objects"]["queries"]["classes"],
+    )
+    network, now = build_network(earlier, "a.ckpt"), build_network(config, "a.ckpt")
+    assert network.classes is PAPER_CLASSES
+    assert {name: value.shape for name, value in network.state_dict().items()} == {
+        name: value.shape for name, value in now.state_dict().items()
+    }
 
 
 def test_a_part_is_no_network(config):

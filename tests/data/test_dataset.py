@@ -385,6 +385,38 @@ def test_the_same_frames_in_every_epoch_and_in_validation(cube_dataset):
         assert torch.equal(other.views.images, first.views.images)
 
 
+def test_objects_of_no_class_are_left_out_of_all_targets(
+    cube_dataset, write_cube, write_annotations, cube_entry, caplog
+):
+    """A chair and, beside it, a bed: which of them there are, is what the classes say."""
+    write_cube("02818832")
+    bed = cube_entry(translation=(3.0, 1.5, 1.0), catid_cad="02818832")
+    write_annotations({"scene0000_00": [cube_entry(), bed]})
+
+    def opened(**classes):
+        found = scan2cad_dataset(
+            cube_dataset, "train", cache_dir=cube_dataset / "cache", classes=classes or None, **SMALL
+        )
+        return found[0]
+
+    of_nine, both = opened(), opened(names=["bed", "chair"], catids=["02818832", None])
+    assert of_nine.objects[0].category == ("chair", "other")
+    assert both.objects[0].category == ("chair", "bed")
+    assert torch.equal(both.foreground, of_nine.foreground)
+    assert "belong to no class" not in caplog.text
+    chair = opened(names=["chair"])
+    assert chair.objects[0].category == ("chair",)
+    assert len(chair.objects[0].shape) == 1
+    assert (
+        "1 of 2 annotated objects belong to no class and are left out, of categories '02818832'"
+        in caplog.text
+    )
+    assert 0 < chair.foreground.sum() < both.foreground.sum()
+    assert 0 < chair.occupancy.sum() < both.occupancy.sum()
+    with pytest.raises(DataError, match="none of the 2 annotated objects"):
+        opened(names=["drill"])
+
+
 def test_objects_are_counted_without_reading_the_scene(cube_dataset):
     dataset = scan2cad_dataset(cube_dataset, "train", cache_dir=cube_dataset / "cache", **SMALL)
     assert [dataset.num_objects(index) for index in range(len(dataset))] == [len(dataset[0].objects[0])]

@@ -10,9 +10,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from raytran.classes import PAPER_CLASSES
-from raytran.errors import ConfigError, ShapeError
-from raytran.metrics import Scan2CADAccuracy
+from raytran.classes import PAPER_CLASSES, Classes
+from raytran.errors import ConfigError, DataError, ShapeError
+from raytran.metrics import AccuracyCurves, ErrorAtlas, OrientedBoxF1, Scan2CADAccuracy
 from raytran.structs import ObjectSet
 
 UPRIGHT = Rotation.from_rotvec([np.pi / 2, 0, 0])
@@ -227,6 +227,42 @@ def test_bad_numbers_match_nothing():
         bad = replace(target, **{part: getattr(target, part) * np.nan})
         assert accuracy(bad, target) == 0
         assert accuracy(target, bad) == 0
+
+
+def test_own_classes():
+    """Two classes of one's own, and the objects of others refused."""
+    classes = Classes(("drill", "lathe"))
+    boxes = ObjectSet(
+        label=torch.tensor([0, 1, 1]),
+        center=torch.tensor([[0.0, 0, 0], [2, 0, 0], [4, 0, 0]]),
+        size=torch.ones(3, 3),
+        rotation=torch.eye(3).repeat(3, 1, 1),
+        symmetry=torch.ones(3, dtype=torch.int64),
+        score=torch.ones(3),
+        classes=classes,
+    )
+    predicted = boxes.select(torch.tensor([1, 0]))
+    results = {}
+    for metric in (Scan2CADAccuracy, OrientedBoxF1, AccuracyCurves, ErrorAtlas):
+        results[metric] = metric(classes=classes.settings())
+        results[metric].update([predicted], [boxes], ["a"])
+        with pytest.raises(DataError, match="objects are of 2 classes with 'drill' and without 'bathtub'"):
+            metric().update([predicted], [boxes], ["a"])
+    accuracy = results[Scan2CADAccuracy].compute()
+    assert {name: entry["accuracy"] for name, entry in accuracy["per_class"].items()} == {
+        "drill": 1.0,
+        "lathe": 0.5,
+    }
+    assert accuracy["class_average"] == pytest.approx(0.75)
+    assert set(results[OrientedBoxF1].compute()["per_threshold"]["0.5"]["per_class"]) == {"drill", "lathe"}
+    assert results[AccuracyCurves].compute()["joint"]["class_average"][9] == pytest.approx(0.75)
+    assert results[ErrorAtlas].compute()["per_class"]["lathe"]["missed"] == 1
+    for metric, protocols in ((Scan2CADAccuracy, ("scan2cad", "vid2cad")), (OrientedBoxF1, ("odam",))):
+        for protocol in protocols:
+            with pytest.raises(
+                ConfigError, match=f"protocol {protocol} is defined on Scan2CAD's nine classes"
+            ):
+                metric(protocol=protocol, classes=classes)
 
 
 def test_errors():

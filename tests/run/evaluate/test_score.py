@@ -256,6 +256,25 @@ def test_scene_json_without_cads(files, caplog):
         run(files, "protocol=scan2cad", predictions="json")
 
 
+def test_own_classes_are_scored_by_the_strict_protocol_alone(files):
+    """Chairs are seats, a lamp is a lamp, and tables are of no class."""
+    own = ["classes.names=[lamp,seat]", f'classes.catids=[["{LAMP}"],["{CHAIR}"]]']
+    of_nine, found = run(files)["strict"], run(files, *own, "protocol=all", output="own")
+    assert "scan2cad" not in found
+    assert (
+        list(found["strict"]["per_class"]) == list(found["strict"]["atlas"]["per_class"]) == ["lamp", "seat"]
+    )
+    assert counts(found["strict"]) == {"lamp": counts(of_nine)["other"], "seat": counts(of_nine)["chair"]}
+    (files / "json").mkdir()
+    (files / "json" / "a.json").write_text(scene_json("a", box("seat", [0, 0, 0.25], [0.5, 1, 0.5])))
+    assert counts(run(files, *own, predictions="json", output="json-out")["strict"])["seat"] == (1, 2)
+    for protocol in ("scan2cad", "vid2cad", "odam"):
+        with pytest.raises(ConfigError, match=f"protocol {protocol} is defined on Scan2CAD's nine classes"):
+            run(files, *own, f"protocol={protocol}", output="refused")
+    with pytest.raises(DataError, match=r"none of the .* annotated objects, of categories"):
+        run(files, "classes.names=[drill]", output="refused")
+
+
 def test_comparison(files):
     (files / "other").mkdir()
     (files / "other" / "a.csv").write_text(ROWS[0] + ROWS[2])

@@ -102,6 +102,9 @@ def test_settings_that_came_later_are_no_change(masks):
     del before["data"]["name"], before["data"]["dataset"]["object_choice"]
     before["data"]["dataset"]["input_mask"] = masks
     del before["variant_prefix"]
+    of_objects = before["model"]["heads"]["objects"]
+    del before["classes"], before["model"]["classes"], before["data"]["dataset"]["classes"]
+    del of_objects["classes"], of_objects["queries"]["classes"]
     assert changed_settings(before, plain(compose("train", typed))) == []
     more = ["loss.shape_layers=all", "data.dataset.object_choice=seen", "loss.yaw_beta=0.2"]
     assert sorted(changed_settings(before, plain(compose("train", [*typed, *more])))) == [
