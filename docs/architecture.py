@@ -16,9 +16,10 @@ from matplotlib.patches import FancyArrowPatch, FancyBboxPatch
 PICTURE = Path(__file__).with_suffix(".png")
 
 COLUMNS: tuple[dict[str, str], ...] = (
-    {"structs": "batch, output,\nprediction", "errors": "one sentence\neach"},
+    {"errors": "one sentence\neach"},
     {"limits": "what numbers\ncan mean", "tensor_archive": "files of torch.save,\nuntrusted"},
-    {"setting_limits": "what settings\ncan mean"},
+    {"classes": "names, colours,\ncategories", "setting_limits": "what settings\ncan mean"},
+    {"structs": "batch, output,\nprediction"},
     {"geometry": "cameras, boxes,\nvoxel grid"},
     {"ops": "rays, pairs,\nsparse attention"},
     {"backbone": "images → voxels", "heads": "voxels → answers"},

@@ -10,11 +10,9 @@ import pytest
 
 LAYERS: list[set[str]] = [
     {"errors"},
-    {"limits"},
-    {"classes"},
+    {"limits", "tensor_archive"},
+    {"classes", "setting_limits"},
     {"structs"},
-    {"tensor_archive"},
-    {"setting_limits"},
     {"geometry"},
     {"ops", "norms"},
     {"backbone", "heads"},

@@ -12,6 +12,7 @@ import torch
 from rich.console import Console
 from torch import nn
 
+from raytran.classes import PAPER_CLASSES
 from raytran.errors import ConfigError
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.run.evaluate.evaluate import TASKS_WITH_SHAPE, evaluate_model, with_at_most
@@ -23,6 +24,7 @@ class Oracle(nn.Module):
     """Predicts the objects it was told, with shapes where they are asked for."""
 
     grid_extent = (20.0, 20.0, 5.0)
+    classes = PAPER_CLASSES
 
     def __init__(self, objects: ObjectSet) -> None:
         super().__init__()

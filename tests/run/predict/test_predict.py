@@ -16,6 +16,7 @@ from PIL import Image
 from torch import nn
 
 from raytran.checkpoints.load import PredictionSettings
+from raytran.classes import PAPER_CLASSES
 from raytran.errors import CheckpointError, ConfigError, DataError
 from raytran.run.entry import compose
 from raytran.run.output import one_writer
@@ -37,6 +38,7 @@ class Oracle(nn.Module):
 
     grid_extent = (8.0, 8.0, 4.0)
     grid_resolution = (4, 4, 2)
+    classes = PAPER_CLASSES
 
     def __init__(self) -> None:
         super().__init__()
