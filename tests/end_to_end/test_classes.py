@@ -16,6 +16,8 @@ from raytran.checkpoints.file import read_checkpoint
 from raytran.checkpoints.runs import LAST
 from raytran.data.scan2cad import annotation_path, read_annotations
 from raytran.errors import CheckpointError, DataError
+from raytran.run.entry import compose
+from raytran.run.export.export_model import described, export_model
 from raytran.viewer.data import read_viewer_scene
 
 from .runs import fit, table
@@ -62,8 +64,11 @@ def test_training_and_the_checkpoint(trained):
         "denoising_queries.embedding": 3,
     }
     assert {size for name, size in shapes.items() if name.startswith("predictors")} == {4}
-    model = load(trained)
-    assert model.classes.names == tuple(NAMES)
+    given_away = trained.with_name("own.safetensors")
+    export_model(compose("export_model", [f"checkpoint={trained}", f"output={given_away}"]))
+    assert load(trained).classes == load(given_away).classes
+    assert load(given_away).classes.names == tuple(NAMES)
+    assert ", ".join(NAMES) in list(described(content, trained).columns[1].cells)
 
 
 def test_evaluate_and_predict_take_them_from_the_checkpoint(trained, settings, rooms, command, tmp_path):
