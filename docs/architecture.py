@@ -21,7 +21,7 @@ COLUMNS: tuple[dict[str, str], ...] = (
     {"classes": "names, colours,\ncategories", "setting_limits": "what settings\ncan mean"},
     {"structs": "batch, output,\nprediction"},
     {"geometry": "cameras, boxes,\nvoxel grid"},
-    {"ops": "rays, pairs,\nsparse attention"},
+    {"ops": "rays, pairs,\nsparse attention", "norms": "batch and layer\nnorms"},
     {"backbone": "images → voxels", "heads": "voxels → answers"},
     {"model": "RayTran"},
     {"losses": "matching, terms", "metrics": "scores", "data": "files → batch", "postprocess": "what counts"},
