@@ -22,6 +22,7 @@ from raytran.metrics import (
     SSIM,
     ForegroundIoU,
     MatchedShapeScores,
+    MeanAveragePrecision,
     NewViewScores,
     OrientedBoxF1,
     Scan2CADAccuracy,
@@ -98,6 +99,7 @@ def cads(index: int) -> tuple[CadAlignments | None, CadAlignments]:
 def results(indices: tuple[int, ...], dtype: torch.dtype = torch.float32) -> dict:
     """Everything the metrics return for a share of the scenes, scenes given one by one."""
     of_objects = {"scan2cad": Scan2CADAccuracy(), "box_f1": OrientedBoxF1(), "shape": MatchedShapeScores()}
+    of_objects |= {"map": MeanAveragePrecision(), "map_aligned": MeanAveragePrecision(boxes="axis_aligned")}
     of_objects |= {"curves": AccuracyCurves(), "atlas": ErrorAtlas(volume_extent=(9.0, 9.0, 3.5))}
     truths = [cads(index)[1] for index in range(SCENES)]
     of_cads = {

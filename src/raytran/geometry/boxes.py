@@ -58,6 +58,12 @@ class OrientedBoxes:
         """Return the volumes, ``(...)`` cubic metres."""
         return self.size.prod(dim=-1)
 
+    def axis_aligned(self) -> OrientedBoxes:
+        """Return the smallest boxes along the world's axes around these, their rotations the identity."""
+        size = (self.rotation.abs() @ self.size[..., None])[..., 0]
+        identity = torch.eye(3, dtype=self.rotation.dtype, device=self.rotation.device)
+        return OrientedBoxes(self.center, size, identity.expand_as(self.rotation))
+
 
 class _Frames(NamedTuple):
     """Boxes as affine frames, box last; ``matrix`` maps [-1, 1]³ onto a box moved to the origin."""
@@ -96,6 +102,30 @@ def box_iou(a: OrientedBoxes, b: OrientedBoxes) -> tuple[Tensor, Tensor]:
     check_shape(b.center, "B 3", "center of the second boxes")
     dtype = torch.float32 if a.center.device.type == "mps" else torch.float64
     return _box_iou(a, b, dtype)
+
+
+def axis_aligned_iou(a: OrientedBoxes, b: OrientedBoxes) -> Tensor:
+    """Return the intersection over union of all pairs of two sets of boxes along the world's axes.
+
+    Args:
+        a: boxes of leading shape ``(A,)``; A may be 0. A box that is turned is replaced by the one around it,
+            see ``OrientedBoxes.axis_aligned``.
+        b: boxes of leading shape ``(B,)``; B may be 0.
+
+    Returns:
+        ``(A, B)`` in [0, 1]; 0 for a box without volume, or with a number that is not finite.
+
+    Raises:
+        ShapeError: a set of boxes has no or more than one leading dimension.
+    """
+    check_shape(a.center, "A 3", "center of the first boxes")
+    check_shape(b.center, "B 3", "center of the second boxes")
+    a, b = a.axis_aligned(), b.axis_aligned()
+    upper = torch.minimum((a.center + a.size / 2)[:, None], b.center + b.size / 2)
+    lower = torch.maximum((a.center - a.size / 2)[:, None], b.center - b.size / 2)
+    intersection = (upper - lower).clamp(min=0).prod(dim=-1)
+    union = a.volume()[:, None] + b.volume() - intersection
+    return torch.where(intersection > 0, intersection / union, 0.0).nan_to_num()
 
 
 def _box_iou(first: OrientedBoxes, second: OrientedBoxes, dtype: torch.dtype) -> tuple[Tensor, Tensor]:

@@ -2,6 +2,7 @@
 """How good a prediction is: torchmetrics classes over pure functions in ``metrics.functional``."""
 
 from raytran.metrics.accuracy_curves import AccuracyCurves
+from raytran.metrics.average_precision import MeanAveragePrecision
 from raytran.metrics.box_f1 import OrientedBoxF1
 from raytran.metrics.error_atlas import ErrorAtlas
 from raytran.metrics.new_views import PSNR, SSIM, NewViewScores
@@ -16,6 +17,7 @@ __all__ = [
     "ErrorAtlas",
     "ForegroundIoU",
     "MatchedShapeScores",
+    "MeanAveragePrecision",
     "NewViewScores",
     "OrientedBoxF1",
     "Scan2CADAccuracy",

@@ -23,6 +23,9 @@ Counts = NDArray[np.float64]
 Statistic = Callable[[Counts], Counts]
 """From summed counts ``(..., C)`` to a number each, ``(...,)``."""
 
+OfScenes = Callable[[NDArray[np.int64]], Counts]
+"""From drawn scenes ``(..., S)``, some of them several times, to a number each, ``(...,)``."""
+
 CONFIDENCE = 0.95
 
 _BATCH = 100
@@ -108,10 +111,22 @@ def bootstrap_interval(
         num_resamples: how often to draw.
         seed: of the drawing; the same seed and scenes give the same interval.
     """
-    value = float(statistic(counts.sum(axis=0)))
-    low, high = _percentile_interval(
-        lambda scenes: statistic(counts[scenes].sum(axis=-2)), len(counts), value, num_resamples, seed
-    )
+    return interval_of_scenes(_summed(counts, statistic), len(counts), num_resamples=num_resamples, seed=seed)
+
+
+def interval_of_scenes(
+    of_scenes: OfScenes, num_scenes: int, *, num_resamples: int = 2000, seed: int = 0
+) -> Interval:
+    """Do as ``bootstrap_interval`` does for a number that no sum over scenes tells.
+
+    Args:
+        of_scenes: the number of drawn scenes, indices in [0, S).
+        num_scenes: S.
+        num_resamples: how often to draw.
+        seed: of the drawing.
+    """
+    value = float(of_scenes(np.arange(num_scenes)))
+    low, high = _percentile_interval(of_scenes, num_scenes, value, num_resamples, seed)
     return Interval(value=value, low=low, high=high)
 
 
@@ -131,12 +146,25 @@ def compare_paired(
         The difference, its bootstrap interval (the same scenes drawn for both sides), and the p-value of the
         permutation test; ``significant`` if that is below 5 %.
     """
-    num_scenes = len(first)
-    # Row s and row S + s are what the two sides found in scene s: a permutation swaps such rows.
     rows = np.concatenate([first, second])
+    return comparison_of_scenes(_summed(rows, statistic), len(first), num_resamples=num_resamples, seed=seed)
+
+
+def comparison_of_scenes(
+    of_rows: OfScenes, num_scenes: int, *, num_resamples: int = 2000, seed: int = 0
+) -> Comparison:
+    """Do as ``compare_paired`` does for a number that no sum over scenes tells.
+
+    Args:
+        of_rows: the number of drawn rows: row s is what the first side found in scene s, row S + s what the
+            second did. A permutation swaps such rows.
+        num_scenes: S.
+        num_resamples: number of bootstrap draws, and of permutations.
+        seed: of both.
+    """
 
     def difference(of_first: NDArray[np.int64], of_second: NDArray[np.int64]) -> Counts:
-        return statistic(rows[of_first].sum(axis=-2)) - statistic(rows[of_second].sum(axis=-2))
+        return of_rows(of_first) - of_rows(of_second)
 
     scenes = np.arange(num_scenes)
     observed = float(difference(scenes, scenes + num_scenes))
@@ -157,8 +185,8 @@ def compare_paired(
         )
         p_value = float(test.pvalue)
     return Comparison(
-        first=float(statistic(first.sum(axis=0))),
-        second=float(statistic(second.sum(axis=0))),
+        first=float(of_rows(scenes)),
+        second=float(of_rows(scenes + num_scenes)),
         difference=observed,
         low=low,
         high=high,
@@ -168,8 +196,13 @@ def compare_paired(
     )
 
 
+def _summed(counts: Counts, statistic: Statistic) -> OfScenes:
+    """Return what a statistic says of the summed counts of drawn scenes."""
+    return lambda drawn: statistic(counts[drawn].sum(axis=-2))
+
+
 def _percentile_interval(
-    of_scenes: Callable[[NDArray[np.int64]], Counts],
+    of_scenes: OfScenes,
     num_scenes: int,
     value: float,
     num_resamples: int,
