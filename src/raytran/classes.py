@@ -61,9 +61,12 @@ class Classes:
             any other name. A category that none lists belongs to the class of its name, or else to ``other``.
             Left out: Scan2CAD's for the names of the paper's classes, none for other names.
 
+    Any printable words can be classes of boxes that are only compared. What a network may call its classes is
+    less, see ``of``.
+
     Raises:
-        ConfigError: there is no class, or there are too many; names are not distinct printable texts; a
-            colour is none; or two classes list the same category.
+        ConfigError: there is no class; names are not distinct printable texts; a colour is none; or two
+            classes list the same category.
     """
 
     names: tuple[str, ...]
@@ -91,11 +94,13 @@ class Classes:
                 text in ``catids`` for a list of it. None: the paper's nine.
 
         Raises:
-            ConfigError: it is something else, or see ``Classes``.
+            ConfigError: it is something else, or see ``Classes``; or there are too many classes, or a name
+                is long or has characters that mean something in paths and configs.
         """
         if settings is None:
             return PAPER_CLASSES
         if isinstance(settings, Classes):
+            _check_names_of_network(settings.names)
             return settings
         if not isinstance(settings, Mapping) or not set(settings) <= {"names", "colors", "catids"}:
             raise ConfigError("classes are given by names, colors and catids: see conf/classes/paper.yaml")
@@ -103,6 +108,7 @@ class Classes:
         for name, given in lists.items():
             if not isinstance(given, list | tuple):
                 raise ConfigError(f"classes.{name}={shown(given)} is no list: write it as [a,b]")
+        _check_names_of_network(lists.get("names", ()))
         return cls(lists.get("names", ()), lists.get("colors", ()), lists.get("catids", ()))
 
     def settings(self) -> dict[str, Any]:
@@ -157,13 +163,25 @@ class Classes:
 
 
 def _check_names(names: Sequence[Any]) -> None:
+    if not names:
+        raise ConfigError("expected at least one class, got 0: name them in classes.names")
+    for name in names:
+        if not isinstance(name, str):
+            raise ConfigError(f'the class {shown(name)} is no text: put it in quotes, as in "{shown(name)}"')
+        if not name or not name.isprintable():
+            raise ConfigError(f"{shown(name)} is no name of a class: give printable characters")
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if list(names).count(name) > 1)
+        raise ConfigError(f"the class {shown(twice)} is named twice: name each once in classes.names")
+
+
+def _check_names_of_network(names: Sequence[Any]) -> None:
+    """Raise unless a network may call its classes so."""
     if not 0 < len(names) <= MAX_CLASSES:
         raise ConfigError(
             f"expected 1 to {MAX_CLASSES} classes, got {len(names)}: name them in classes.names"
         )
-    for name in names:
-        if not isinstance(name, str):
-            raise ConfigError(f'the class {shown(name)} is no text: put it in quotes, as in "{shown(name)}"')
+    for name in filter(lambda name: isinstance(name, str), names):
         is_proper = name[:1].isalnum() and name == name.rstrip() and name.isprintable()
         if not is_proper or len(name) > _MAX_NAME:
             raise ConfigError(
@@ -174,9 +192,6 @@ def _check_names(names: Sequence[Any]) -> None:
             raise ConfigError(
                 f"{shown(name)} cannot be the name of a class: take one without / \\ $, not {PADDING_NAME}"
             )
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if list(names).count(name) > 1)
-        raise ConfigError(f"the class {shown(twice)} is named twice: name each once in classes.names")
 
 
 def _entries(what: str, given: Sequence[Any], names: Sequence[str]) -> Sequence[Any]:

@@ -43,7 +43,7 @@ from raytran.data.shapenet.meshes import read_binvox, read_face_colors, read_obj
 from raytran.data.shapenet.models import read_facts, read_mesh
 from raytran.data.targets import _scan_surface
 from raytran.export import read_scene_json, write_prediction
-from raytran.export.read import read_alignments_csv, read_predictions, read_roca_csv
+from raytran.export.read import BOXER_COLUMNS, read_alignments_csv, read_predictions, read_roca_csv
 from raytran.rooms.library import read_library
 from raytran.rooms.sweethome3d.catalogue import FurnitureLibrary
 from raytran.rooms.sweethome3d.mesh import read_piece
@@ -561,6 +561,13 @@ def read_evaluation(folder: Path) -> None:
     read_predictions(folder / "predictions", ["scene0000_00"], {})
 
 
+def read_map_evaluation(folder: Path) -> None:
+    evaluation = evaluate_predictions(
+        folder / "predictions", folder / "truth", "map", boxes="axis_aligned", num_resamples=5
+    )
+    json.dumps(evaluation.metrics, allow_nan=False)
+
+
 def read_result(folder: Path) -> None:
     scene = read_viewer_scene(folder)
     check_objects(scene.objects)
@@ -661,7 +668,7 @@ def results(root: Path) -> list[Input]:
     """Return predictions, results of commands, and records of runs."""
     folders = {
         name: root / name
-        for name in ("scene", "csv", "roca", "evaluate", "cameras", "render", "run", "viewer")
+        for name in ("scene", "csv", "roca", "evaluate", "map", "cameras", "render", "run", "viewer")
     }
     for name in ("csv", "roca", "cameras", "render"):
         folders[name].mkdir()
@@ -682,6 +689,12 @@ def results(root: Path) -> list[Input]:
         json.dumps([annotation("scene0000_00"), annotation("scene0002_00")])
     )
     (folders["evaluate"] / "split.txt").write_text("scene0000_00\nscene0002_00\n")
+    for name in ("truth", "predictions"):
+        (folders["map"] / name).mkdir(parents=True)
+    shutil.copy(inner / "scene0002_00.json", folders["map"] / "truth")
+    rows = [f"0,1,2,0.5,1,0,0,0,1,1,1,{name},0,32,0.9\n" for name in ("bathtub", "coffee table")]
+    boxer = folders["map"] / "predictions" / "scene0002_00.csv"
+    boxer.write_text("".join([",".join(BOXER_COLUMNS) + "\n", *rows]))
     pose = look_along_x(0.0).tolist()
     view = {"world_from_camera": pose, "name": "a"}
     views = {
@@ -707,6 +720,7 @@ def results(root: Path) -> list[Input]:
         Input("csv", folders["csv"], read_csv_of_scan),
         Input("roca-csv", folders["roca"], read_csv_of_all),
         Input("evaluate", folders["evaluate"], read_evaluation),
+        Input("evaluate-map", folders["map"], read_map_evaluation),
         Input("viewer", folders["viewer"], read_result, ("*",), change_about),
         Input("viewer-mesh", folders["viewer"], read_result, ("meshes/*",)),
         Input("cameras", folders["cameras"], read_cameras),

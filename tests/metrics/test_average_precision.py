@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from raytran.classes import Classes
 from raytran.errors import ConfigError
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.metrics import MeanAveragePrecision
@@ -16,6 +17,7 @@ from raytran.metrics.average_precision import mean_of_draws
 from raytran.structs import ObjectSet
 
 NAMES = ("bed", "chair", "night stand", "window")
+KINDS = Classes(NAMES)
 
 
 def boxes(label, center, *, size=1.0, yaw=0.0, score=1.0) -> ObjectSet:
@@ -36,6 +38,7 @@ def boxes(label, center, *, size=1.0, yaw=0.0, score=1.0) -> ObjectSet:
         rotation=turn,
         symmetry=torch.ones(count, dtype=torch.int64),
         score=column(score),
+        classes=KINDS,
     )
 
 
@@ -150,7 +153,7 @@ def test_equals_plain_loops(form, ties):
     for turned in (True, False):
         scenes = [random_scene(rng, turned=turned, ties=ties) for _ in range(12)]
         names = [f"scene{number:02}" for number in range(12)]
-        metric = MeanAveragePrecision(boxes=form, class_names=NAMES)
+        metric = MeanAveragePrecision(boxes=form, classes=KINDS)
         shuffled = rng.permutation(12).tolist()  # as scenes arrive from several ranks
         for some in (shuffled[:5], shuffled[5:]):
             metric.update(
@@ -174,7 +177,7 @@ def test_equals_plain_loops(form, ties):
 
 
 def judged(*scenes, **settings):
-    metric = MeanAveragePrecision(class_names=NAMES, **settings)
+    metric = MeanAveragePrecision(classes=KINDS, **settings)
     metric.update([found for found, _ in scenes], [true for _, true in scenes], list("abcdef"[: len(scenes)]))
     return metric.compute()
 
@@ -244,7 +247,7 @@ def test_equals_come_by_scene_and_then_in_order():
     right, wrong = boxes([0], [[0, 0, 0]]), boxes([0], [[9, 0, 0]])
     for order in ([0, 1], [1, 0]):
         for names, expected in ((("a", "b"), 1.0), (("b", "a"), 0.5)):
-            metric = MeanAveragePrecision(class_names=NAMES)
+            metric = MeanAveragePrecision(classes=KINDS)
             for index in order:
                 metric.update([(right, wrong)[index]], [(true, nothing)[index]], [names[index]])
             assert metric.compute()["iou_0.25"]["mean"] == expected
@@ -255,7 +258,7 @@ def test_equals_come_by_scene_and_then_in_order():
 
 def test_of_objects_that_overlap_as_much_the_first_is_taken():
     true = boxes([0, 0], [[0, 0, 0], [0, 0, 0]])
-    metric = MeanAveragePrecision(class_names=NAMES)
+    metric = MeanAveragePrecision(classes=KINDS)
     metric.update([boxes([0, 0], [[0, 0, 0], [0, 0, 0]])], [true], ["a"])
     assert [row["matched_0.5"] for row in metric.rows()] == [True, False]
     assert metric.compute()["iou_0.5"]["mean"] == 0.5
@@ -287,14 +290,14 @@ def test_the_box_around_a_turned_box():
 def test_scenes_drawn_several_times_count_as_copies():
     rng = np.random.default_rng(3)
     scenes = [random_scene(rng, turned=True, ties=False) for _ in range(6)]
-    metric = MeanAveragePrecision(class_names=NAMES)
+    metric = MeanAveragePrecision(classes=KINDS)
     metric.update(*zip(*scenes, strict=True), [str(number) for number in range(6)])
     for column, threshold in enumerate((0.25, 0.5)):
         of_draws = mean_of_draws(metric.scenes_by_name(), NAMES, column)
         drawn = np.array([[0, 1, 2, 3, 4, 5], [5, 5, 1, 0, 1, 5], [2, 2, 2, 2, 2, 2]])
         expected = []
         for draw in drawn.tolist():
-            copies = MeanAveragePrecision(class_names=NAMES)
+            copies = MeanAveragePrecision(classes=KINDS)
             names = [f"{index}-{number}" for number, index in enumerate(draw)]
             copies.update(*zip(*[scenes[index] for index in draw], strict=True), names)
             expected.append(copies.compute()[f"iou_{threshold}"]["mean"])
@@ -304,7 +307,7 @@ def test_scenes_drawn_several_times_count_as_copies():
 def test_rows():
     true = boxes([1, 1], [[0, 0, 0], [5, 0, 0]])
     found = boxes([1, 0], [[0, 0, 0.5], [5, 0, 0]])
-    metric = MeanAveragePrecision(class_names=NAMES)
+    metric = MeanAveragePrecision(classes=KINDS)
     metric.update([found], [true], ["a"])
     first, second = metric.rows("object")
     assert first.pop("best_iou") == pytest.approx(1 / 3)

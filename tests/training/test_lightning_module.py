@@ -9,6 +9,7 @@ import lightning.pytorch as pl
 import pytest
 import torch
 
+from raytran.errors import ConfigError
 from raytran.structs import ObjectSet
 from raytran.training.callbacks.stage import StageCallback
 
@@ -45,6 +46,17 @@ def test_terms_and_scores_are_logged_by_split_and_task(batch, make_module):
         "val/foreground/iou",
     ):
         assert 0 <= logged[name] <= 1, name
+
+
+def test_mean_average_precision_is_logged_on_request(batch, make_module):
+    logged = fit(make_module("stage2", "map_boxes=oriented"), batch, max_steps=1).logged_metrics
+    for name in ("map_0.25", "map_0.5", "map_0.5/chair", "map_0.5/table"):
+        assert 0 <= logged[f"val/objects/{name}"] <= 1, name
+    plain = fit(make_module("stage2"), batch, max_steps=1).logged_metrics
+    assert not any("map" in name for name in plain)
+    assert all(torch.equal(logged[name], value) for name, value in plain.items() if name.startswith("val/"))
+    with pytest.raises(ConfigError, match="unknown boxes=upright"):
+        make_module("stage2", "map_boxes=upright")
 
 
 def test_new_views_are_scored_beside_answers_that_render_nothing(batch, make_module):

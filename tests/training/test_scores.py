@@ -94,3 +94,19 @@ def test_metrics_of_ones_own() -> None:
     assert scores.results() == scores.compute() == {"found": 2.0}
     scores.reset()
     assert scores.compute() == {"found": 0.0}
+
+
+def test_mean_average_precision_of_predictions_of_every_score() -> None:
+    truth = objects([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]], [1.0, 1.0])
+    found = objects([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0], [3.0, 0.0, 0.0]], [0.9, 0.4, 0.1])
+    scores = SceneScores(tasks=["objects"], map_boxes="axis_aligned")
+    scores.update(batch(truth), [ScenePrediction("a", found, torch.zeros(3))])
+    expected = pytest.approx((1 + 2 / 3) / 2)
+    assert scores.results()["map"]["iou_0.5"]["mean"] == expected
+    numbers = scores.compute()
+    assert (numbers["objects/map_0.25"], numbers["objects/map_0.5/chair"]) == (expected, expected)
+    assert [row["map_matched_0.5"] for row in scores.rows("object")] == [True, True]
+    assert [row["matched_0.5"] for row in scores.rows("object")] == [True, False]
+    scores.reset()
+    assert scores.results()["map"]["n_true"] == {}
+    assert "map" not in SceneScores(tasks=["objects"]).results()

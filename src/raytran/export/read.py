@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Predictions read from files that anybody may have written: ``scene.json``, Scan2CAD's and ROCA's CSV."""
+"""Boxes read from files that anybody may have written: ``scene.json``, Scan2CAD's, ROCA's and Boxer's CSV."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import csv
 import logging
 import math
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ from raytran.data.text import as_name, read_json_object, read_text
 from raytran.errors import ConfigError, DataError
 from raytran.export.cad_alignments import ALIGNMENTS, SCAN2CAD_COLUMNS, align_cads
 from raytran.export.write import FORMAT
-from raytran.geometry.rotation import matrix_from_quaternion
+from raytran.geometry.rotation import matrix_from_quaternion, upright_basis
 from raytran.limits import (
     BOX_SIDE,
     MATRIX_ENTRY,
@@ -50,6 +50,17 @@ _VID2CAD = (*_EXAMPLE, "", "num_views", "score")
 """The 16 columns of Vid2CAD's result file as ODAM reads it (eval_scan2cad.py); the 14th is not read, nor is
 the number of views."""
 
+BOXER_COLUMNS: tuple[str, ...] = (
+    *("time_ns", "tx_world_object", "ty_world_object", "tz_world_object"),
+    *("qw_world_object", "qx_world_object", "qy_world_object", "qz_world_object"),
+    *("scale_x", "scale_y", "scale_z", "name", "instance", "sem_id", "prob"),
+)
+"""The 15 columns of Boxer's boxes (ObbCsvWriter2 in its utils/file_io.py), which stand below a header row."""
+
+_BOXER_FILES = ("boxer_3dbbs_fused.csv", "boxer_3dbbs_tracked.csv", "boxer_3dbbs.csv")
+"""What Boxer writes into the folder of a sequence: the boxes of all frames fused, of its tracker, and of each
+frame; the first that is there counts."""
+
 _OF_ONE_SCAN = (SCAN2CAD_COLUMNS, _SCORED)
 _OF_MANY_SCANS = (ROCA_COLUMNS, _EXAMPLE, _VID2CAD)
 """Columns of the files that hold the alignments of one scan, and of many."""
@@ -78,16 +89,60 @@ _LEAST_LENGTH = 1e-9
 _MAX_CSV = 16 * 2**20
 """Bytes of a CSV that are read: all rows of Scan2CAD's benchmark have three megabytes."""
 
+_SIDE = Quantity(BOX_SIDE.name, -BOX_SIDE.high, BOX_SIDE.high)
+"""Of either sign here: what a size that is not positive means is said in words of its own."""
+
 _QUANTITIES: dict[str, Quantity] = {
     **dict.fromkeys(("tx", "ty", "tz"), POSITION),
     **dict.fromkeys(("qw", "qx", "qy", "qz"), QUATERNION),
-    # Of either sign here: what a scale that is not positive means is said in words of its own.
+    # Of either sign too.
     **dict.fromkeys(("sx", "sy", "sz"), Quantity(SCALE.name, -SCALE.high, SCALE.high)),
+    **dict.fromkeys(BOXER_COLUMNS[1:4], POSITION),
+    **dict.fromkeys(BOXER_COLUMNS[4:8], QUATERNION),
+    **dict.fromkeys(BOXER_COLUMNS[8:11], _SIDE),
 }
 """What the columns of numbers measure, but for the score."""
 
 CadBoxes = Mapping[str, tuple[Tensor, Tensor]]
 """Centre and half extents ``(3,)`` of each annotated CAD model's box in CAD units, by ``catid/id``."""
+
+
+@dataclass(frozen=True)
+class NamedBoxes:
+    """The boxes of one scene under the names of classes that a file gives them.
+
+    Attributes:
+        path: the file.
+        scene_id: what the file calls its scene; empty where it does not.
+        category: the class of each box.
+        objects: the boxes, all with label 0.
+        listed: what the file says of its classes, unread; None: nothing.
+    """
+
+    path: Path
+    scene_id: str
+    category: tuple[str, ...]
+    objects: ObjectSet
+    listed: Any = None
+
+    def labelled(self, classes: Classes, *, leave_out_others: bool = False) -> ObjectSet:
+        """Return the boxes as objects of some classes.
+
+        Args:
+            classes: that they are of.
+            leave_out_others: leave out the boxes of other classes.
+
+        Raises:
+            DataError: one is of another class, and is not to be left out.
+        """
+        place = {name: label for label, name in enumerate(classes.names)}
+        other = next((name for name in self.category if name not in place), None)
+        if other is not None and not leave_out_others:
+            raise DataError(
+                f"{self.path} has an object of category {shown(other)}: choose one of {classes}"
+            )
+        label = torch.tensor([place.get(name, -1) for name in self.category], dtype=torch.int64)
+        return replace(self.objects, label=label, classes=classes).select(label >= 0)
 
 
 @dataclass(frozen=True)
@@ -103,6 +158,7 @@ class ScenePredictions:
             objects without CAD models.
         n_unknown_cads: predictions left out of some of these, since the annotations do not know the box of
             their CAD model.
+        n_other_classes: predictions left out of all, since nothing is asked for of their class.
     """
 
     path: Path
@@ -110,6 +166,7 @@ class ScenePredictions:
     boxes: CadAlignments
     cads: CadAlignments | None
     n_unknown_cads: int = 0
+    n_other_classes: int = 0
 
 
 @dataclass(frozen=True)
@@ -125,26 +182,35 @@ class PredictionFiles:
             "n_scenes_with_predictions": len(self.scenes),
             "n_scenes_ignored": len(self.ignored),
             "n_predictions_without_known_cad": sum(scene.n_unknown_cads for scene in self.scenes.values()),
+            "n_predictions_of_other_classes": sum(scene.n_other_classes for scene in self.scenes.values()),
         }
 
 
 def read_predictions(
-    path: Path, scene_ids: Collection[str], cad_boxes: CadBoxes, classes: Classes = PAPER_CLASSES
+    path: Path,
+    scene_ids: Collection[str],
+    cad_boxes: CadBoxes,
+    classes: Classes = PAPER_CLASSES,
+    *,
+    leave_out_others: bool = False,
 ) -> PredictionFiles:
     """Read the predictions for the scenes asked for.
 
     Args:
         path: a folder of ``<scene_id>.json`` or ``<scene_id>/scene.json`` (``raytran.scene/1``) or
-            ``<scene_id>.csv`` (Scan2CAD, 12 columns); or the folder of one scene, with its ``scene.json``;
-            or a CSV with all scenes, of ROCA's 14 columns, Scan2CAD's 13 or Vid2CAD's 16.
+            ``<scene_id>.csv`` (Scan2CAD's 12 columns, or Boxer's 15 below their header) or Boxer's results,
+            ``<scene_id>/boxer_3dbbs_fused.csv``; or the folder of one scene; or a CSV with all scenes, of
+            ROCA's 14 columns, Scan2CAD's 13 or Vid2CAD's 16, or one of Boxer's.
         scene_ids: the annotated scenes; others are ignored, without being opened.
         cad_boxes: of the CAD models that the annotations name.
-        classes: that the objects are of; CAD models of no class have no box of protocol ``strict``.
+        classes: that the objects are of; CAD models of no class have no box.
+        leave_out_others: predictions of other classes are left out and counted, and boxes may be flat. Else
+            another class in a ``scene.json`` is an error.
 
     Raises:
         DataError: nothing there is for any of the scenes, a scene occurs twice, or a file is damaged.
     """
-    if path.is_file():
+    if path.is_file() and not is_boxer_csv(path):
         alignments = _with_known_ids(read_roca_csv(path), scene_ids)
         ignored = tuple(alignments.keys() - set(scene_ids))
         scenes = {
@@ -153,10 +219,12 @@ def read_predictions(
             if name in scene_ids
         }
     else:
-        files = _files_by_scene(path)
+        files = files_by_scene(path)
         ignored = tuple(name for name in files if name not in scene_ids)
         scenes = {
-            name: _read_scene(files[name], name, cad_boxes, classes) for name in files if name in scene_ids
+            name: _read_scene(files[name], name, cad_boxes, classes, leave_out_others)
+            for name in files
+            if name in scene_ids
         }
     if not scenes:
         raise DataError(
@@ -174,6 +242,8 @@ def read_predictions(
             path,
             unknown,
         )
+    if others := result.counts()["n_predictions_of_other_classes"]:
+        _log.warning("%s: left out %d predictions of classes that are not asked for", path, others)
     return result
 
 
@@ -190,52 +260,120 @@ def _with_known_ids(
     return renamed if len(renamed) == len(alignments) else alignments
 
 
-def _files_by_scene(folder: Path) -> dict[str, Path]:
-    """Return the file of each scene in a folder, by name."""
-    if not folder.is_dir():
-        raise DataError(f"no predictions at {folder}: give a folder, or a CSV with all scenes")
+def files_by_scene(path: Path) -> dict[str, Path]:
+    """Return the file of each scene, by name.
+
+    Args:
+        path: a folder as of ``read_predictions``, or one of Boxer's files.
+
+    Raises:
+        DataError: there is no such folder, or two files of one scene.
+    """
+    if path.is_file():
+        return {_named_by_boxer(path): path}
+    if not path.is_dir():
+        raise DataError(f"no predictions at {path}: give a folder, or a CSV with all scenes")
     files: dict[str, Path] = {}
-    for entry in sorted(folder.iterdir()):
-        path = entry / "scene.json" if entry.is_dir() else entry
-        if entry.name.startswith(".") or path.suffix not in (".json", ".csv") or not path.is_file():
+    of_boxer = _boxers_choice(path)
+    for entry in sorted(path.iterdir()):
+        file = (_boxers_choice(entry) or entry / "scene.json") if entry.is_dir() else entry
+        if entry.name.startswith(".") or file.suffix not in (".json", ".csv") or not file.is_file():
             continue
         if entry.name == ALIGNMENTS:  # raytran.predict writes it beside a scene.json of the same objects
             continue
         name = entry.name if entry.is_dir() else entry.stem
         if entry.name == "scene.json":  # the folder is one that raytran.predict has written for one scene
-            name = read_scene_json(entry).scene_id
+            name = _read_scene_json(entry, scored=False).scene_id
+        elif entry.name in _BOXER_FILES:
+            if entry != of_boxer:
+                continue
+            name = _named_by_boxer(entry)
         if name in files:
-            raise DataError(f"{files[name]} and {path} both hold scene {name}: delete one of them")
-        files[name] = path
+            raise DataError(f"{files[name]} and {file} both hold scene {name}: delete one of them")
+        files[name] = file
     return files
 
 
-def _read_scene(path: Path, scene_id: str, cad_boxes: CadBoxes, classes: Classes) -> ScenePredictions:
-    if path.suffix == ".csv":
+def _boxers_choice(folder: Path) -> Path | None:
+    """Return the file that counts of those that Boxer has written into a folder, None if it has not."""
+    return next((folder / name for name in _BOXER_FILES if (folder / name).is_file()), None)
+
+
+def _named_by_boxer(path: Path) -> str:
+    """Return the scene of one of Boxer's files, which is its folder's name; its own if it was renamed."""
+    return path.absolute().parent.name if path.name in _BOXER_FILES else path.stem
+
+
+def _read_scene(
+    path: Path, scene_id: str, cad_boxes: CadBoxes, classes: Classes, leave_out_others: bool
+) -> ScenePredictions:
+    if path.suffix == ".csv" and not is_boxer_csv(path):
         return _from_alignments(path, read_alignments_csv(path), cad_boxes, classes)
-    prediction = read_scene_json(path, classes)
-    if prediction.scene_id not in (scene_id, ""):
+    named = read_named_boxes(path, scene_id, flat=leave_out_others)
+    # Boxer's words are free.
+    objects = named.labelled(classes, leave_out_others=leave_out_others or path.suffix == ".csv")
+    scene = _from_objects(path, objects, cad_boxes)
+    return replace(scene, n_other_classes=len(named.objects) - len(objects))
+
+
+def read_named_boxes(
+    path: Path,
+    scene_id: str,
+    *,
+    scored: bool = True,
+    flat: bool = False,
+) -> NamedBoxes:
+    """Read the boxes of one scene, of whatever classes.
+
+    Args:
+        path: ``raytran.scene/1`` or Boxer's CSV.
+        scene_id: what the scene is called; a file that gives it another name is an error.
+        scored: False reads true boxes, whose scores are 1 whatever the file says.
+        flat: a size may be 0; such boxes are counted in a warning, as they overlap with nothing.
+
+    Raises:
+        DataError: the file is missing or damaged, or of another form.
+    """
+    if path.suffix == ".csv":
+        named = read_boxer_csv(path, flat=flat)
+    else:
+        named = _read_scene_json(path, scored=scored, flat=flat)
+    if named.scene_id not in (scene_id, ""):
         raise DataError(
-            f"{path} says that it is scene {prediction.scene_id!r}, but its name says {scene_id!r}: rename it"
+            f"{path} says that it is scene {named.scene_id!r}, but its name says {scene_id!r}: rename it"
         )
-    return _from_objects(path, prediction.objects, cad_boxes)
+    without_volume = int((named.objects.size == 0).any(dim=1).sum())
+    if without_volume:
+        _log.warning("%s: %d boxes have no volume, and overlap with nothing", path, without_volume)
+    return named
 
 
-def _check_objects(objects: ObjectSet, path: Path) -> None:
-    """Raise on an object that nothing can be compared with, naming its line."""
+def _check_objects(
+    objects: ObjectSet, path: Path, line_of: Callable[[int], int], *, flat: bool = False
+) -> None:
+    """Raise on an object that nothing can be compared with, naming its line.
+
+    Args:
+        objects: what was read.
+        path: from where.
+        line_of: the line of an object's number.
+        flat: a size may be 0.
+    """
     identity = torch.eye(3, dtype=torch.float64)
     rotation = objects.rotation.nan_to_num()
     skew = (rotation.mT @ rotation - identity).abs().amax(dim=(-2, -1))
     numbers = [objects.center, objects.size, objects.rotation.flatten(1), objects.score[:, None]]
     faults = {
         "a number is not finite, or kilometres": ~torch.cat(numbers, dim=1).isfinite().all(dim=1),
-        "a size is not positive": (objects.size <= 0).any(dim=1),
+        "a size is negative" if flat else "a size is not positive": (
+            objects.size < 0 if flat else objects.size <= 0
+        ).any(dim=1),
         "the rotation is no rotation matrix": (skew > _NOT_ORTHOGONAL) | (torch.linalg.det(rotation) <= 0),
     }
     for fault, where in faults.items():
         if where.any():
             index = int(where.nonzero()[0])
-            raise DataError(f"{path}, line {_line_of_object(path, index)}: {fault}, mend object {index}")
+            raise DataError(f"{path}, line {line_of(index)}: {fault}, mend object {index}")
 
 
 def _line_of_object(path: Path, index: int) -> int:
@@ -265,7 +403,14 @@ def _from_alignments(
         classes=classes,
     )
     objects = objects.select(objects.label >= 0)
-    return ScenePredictions(path, objects, cads, cads, n_unknown_cads=len(cads) - len(known))
+    return ScenePredictions(
+        path,
+        objects,
+        cads,
+        cads,
+        n_unknown_cads=len(cads) - len(known),
+        n_other_classes=sum(classes.label_of(catid) is None for catid in cads.catid),
+    )
 
 
 def _sizes(sizes: Tensor, path: Path) -> Tensor:
@@ -322,7 +467,20 @@ def read_scene_json(path: Path, classes: Classes | None = None) -> ScenePredicti
     Raises:
         DataError: the file is missing, damaged, of another format, or names an unknown category.
     """
-    path = Path(path)
+    named = _read_scene_json(Path(path))
+    if classes is None:
+        try:
+            classes = Classes.of(named.listed)
+        except ConfigError as error:
+            raise DataError(f"{path} lists classes that are none ({error}): write it again") from error
+    return ScenePrediction(
+        scene_id=named.scene_id,
+        objects=named.labelled(classes),
+        grid_center=torch.full((3,), torch.nan),
+    )
+
+
+def _read_scene_json(path: Path, *, scored: bool = True, flat: bool = False) -> NamedBoxes:
     if not path.exists():
         raise DataError(f"no scene file at {path}; write one with `python -m raytran.predict`")
     content = read_json_object(path)
@@ -332,25 +490,17 @@ def read_scene_json(path: Path, classes: Classes | None = None) -> ScenePredicti
     entries = content.get("objects")
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise DataError(f"{path} has no list of objects: write it again")
-    if classes is None:
-        try:
-            classes = Classes.of(content.get("classes"))
-        except ConfigError as error:
-            raise DataError(f"{path} lists classes that are none ({error}): write it again") from error
     # One may write an empty name.
     scene_id = content.get("scene_id") and as_name(content["scene_id"], f"scene_id in {path}")
     if not isinstance(scene_id, str):
         raise DataError(f"{path} has no scene_id: write it again")
-    prediction = ScenePrediction(
-        scene_id=scene_id,
-        objects=_objects_from_json(entries, classes, path),
-        grid_center=torch.full((3,), torch.nan),
-    )
-    _check_objects(prediction.objects, path)
-    return prediction
+    category = tuple(as_name(entry.get("category"), f"category of an object in {path}") for entry in entries)
+    objects = _objects_from_json(entries, path, scored=scored)
+    _check_objects(objects, path, lambda index: _line_of_object(path, index), flat=flat)
+    return NamedBoxes(path, scene_id, category, objects, content.get("classes"))
 
 
-def _objects_from_json(entries: Sequence[dict[str, Any]], classes: Classes, path: Path) -> ObjectSet:
+def _objects_from_json(entries: Sequence[dict[str, Any]], path: Path, *, scored: bool) -> ObjectSet:
     count = len(entries)
 
     def column(key: str, quantity: Quantity, *shape: int) -> torch.Tensor:
@@ -361,22 +511,14 @@ def _objects_from_json(entries: Sequence[dict[str, Any]], classes: Classes, path
 
     models = tuple(_model_id(entry, path) for entry in entries)
     return ObjectSet(
-        label=torch.tensor([_label(entry, classes, path) for entry in entries], dtype=torch.int64),
+        label=torch.zeros(count, dtype=torch.int64),
         center=column("center", POSITION, 3),
-        size=column("size", Quantity("a length in metres", -BOX_SIDE.high, BOX_SIDE.high), 3),
+        size=column("size", _SIDE, 3),
         rotation=column("rotation", MATRIX_ENTRY, 3, 3),
         symmetry=torch.ones(count, dtype=torch.int64),
-        score=column("score", SCORE),
+        score=column("score", SCORE) if scored else torch.ones(count, dtype=torch.float64),
         model_id=models if any(models) else (),
-        classes=classes,
     )
-
-
-def _label(entry: Mapping[str, Any], classes: Classes, path: Path) -> int:
-    category = entry.get("category")
-    if category not in classes.names:
-        raise DataError(f"{path} has an object of category {shown(category)}: choose one of {classes}")
-    return classes.index(category)
 
 
 def _model_id(entry: Mapping[str, Any], path: Path) -> str:
@@ -384,6 +526,67 @@ def _model_id(entry: Mapping[str, Any], path: Path) -> str:
     if not entry.get("id_cad"):
         return ""
     return "/".join(as_name(entry.get(key), f"{key} in {path}") for key in ("catid_cad", "id_cad"))
+
+
+def is_boxer_csv(path: Path) -> bool:
+    """Say whether a file begins with the header row of Boxer's boxes."""
+    if path.suffix != ".csv":
+        return False
+    first = next((line for line in read_text(path, max_bytes=_MAX_CSV).splitlines() if line.strip()), "")
+    return [cell.strip() for cell in first.split(",")] == list(BOXER_COLUMNS)
+
+
+def read_boxer_csv(path: Path, *, flat: bool = False) -> NamedBoxes:
+    """Read the boxes of one scene that Boxer has written, or a program that writes the same columns.
+
+    A box there has its own z axis up; here it is turned to have its y axis up, as all objects, and its sizes
+    are (x, z, y) of the file's: it is the same box. Its position is that of the file's world. Boxes of
+    different frames are separate predictions, of which a warning tells.
+
+    Args:
+        path: the file, with its header row.
+        flat: a size may be 0.
+
+    Raises:
+        DataError: the file cannot be read, or a row has another number of columns or a wrong value.
+    """
+    lines: list[int] = []
+    rows: list[list[float]] = []
+    names: list[str] = []
+    times: set[str] = set()
+    for line, cells in _cells(path):
+        if not lines and cells == list(BOXER_COLUMNS):
+            continue
+        if len(cells) != len(BOXER_COLUMNS):
+            raise DataError(
+                f"{path}, line {line} has {len(cells)} columns: write the {len(BOXER_COLUMNS)} columns "
+                f"{','.join(BOXER_COLUMNS)}"
+            )
+        row = dict(zip(BOXER_COLUMNS, cells, strict=True))
+        columns = (*BOXER_COLUMNS[1:11], "prob")
+        rows.append(_numbers([row[column] for column in columns], columns, path, line))
+        if math.hypot(*rows[-1][3:7]) < _LEAST_LENGTH:
+            raise DataError(f"{path}, line {line}: the quaternion has length zero, write a rotation")
+        names.append(as_name(row["name"], f"name in line {line} of {path}"))
+        lines.append(line)
+        times.add(row["time_ns"])
+    if len(times) > 1:
+        _log.warning(
+            "%s holds boxes of %d frames, each of which counts as a prediction of its own: fuse them first, "
+            "with Boxer's --fuse or --track",
+            *(path, len(times)),
+        )
+    numbers = torch.tensor(rows, dtype=torch.float64).reshape(len(rows), 11)
+    objects = ObjectSet(
+        label=torch.zeros(len(rows), dtype=torch.int64),
+        center=numbers[:, :3],
+        size=numbers[:, [7, 9, 8]],
+        rotation=matrix_from_quaternion(numbers[:, 3:7]) @ upright_basis(dtype=torch.float64),
+        symmetry=torch.ones(len(rows), dtype=torch.int64),
+        score=numbers[:, 10],
+    )
+    _check_objects(objects, path, lambda index: lines[index], flat=flat)
+    return NamedBoxes(path, "", tuple(names), objects)
 
 
 class _Row(NamedTuple):
@@ -445,16 +648,7 @@ def _read_rows(path: Path, forms: Sequence[tuple[str, ...]]) -> list[_Row]:
     not_unit: list[int] = []
     columns: tuple[str, ...] | None = None
     is_first = True
-    try:
-        lines = read_text(path, max_bytes=_MAX_CSV).splitlines()
-        separator = ";" if lines and "," not in lines[0] else ","  # spreadsheets write semicolons
-        table = list(csv.reader(lines, delimiter=separator))
-    except csv.Error as error:
-        raise DataError(f"cannot read the alignments {path} ({error}): check the path") from error
-    for line, cells in enumerate(table, start=1):
-        cells = [cell.strip() for cell in cells]
-        if not any(cells):
-            continue
+    for line, cells in _cells(path):
         is_first, may_be_header = False, is_first
         if may_be_header and len(cells) in map(len, forms) and _is_header(cells[3:]):
             _log.warning("%s, line %d: skipped a header row", path, line)
@@ -478,6 +672,20 @@ def _read_rows(path: Path, forms: Sequence[tuple[str, ...]]) -> list[_Row]:
             *(path, not_unit[0], len(not_unit)),
         )
     return rows
+
+
+def _cells(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Give the cells of each row that is not empty, with the number of its line."""
+    try:
+        lines = read_text(path, max_bytes=_MAX_CSV).splitlines()
+        separator = ";" if lines and "," not in lines[0] else ","  # spreadsheets write semicolons
+        table = list(csv.reader(lines, delimiter=separator))
+    except csv.Error as error:
+        raise DataError(f"cannot read the alignments {path} ({error}): check the path") from error
+    for line, cells in enumerate(table, start=1):
+        stripped = [cell.strip() for cell in cells]
+        if any(stripped):
+            yield line, stripped
 
 
 def _form_of(cells: Sequence[str], forms: Sequence[tuple[str, ...]]) -> tuple[str, ...] | None:

@@ -34,7 +34,7 @@ from raytran.geometry.boxes import OrientedBoxes, axis_aligned_iou, box_iou
 from raytran.metrics.bootstrap import Counts, OfScenes
 from raytran.metrics.functional.detection import score_order
 from raytran.metrics.per_scene import ObjectMetric, Row, SceneRecord
-from raytran.structs import CLASSES, ObjectSet
+from raytran.structs import ObjectSet
 
 BOX_FORMS: tuple[str, ...] = ("oriented", "axis_aligned")
 
@@ -68,8 +68,7 @@ class MeanAveragePrecision(ObjectMetric):
         boxes: ``"oriented"`` compares the boxes as they are, by their exact IoU; ``"axis_aligned"`` the boxes
             along the world's axes around them, as the labels of ScanNet are boxes around instances.
         iou_thresholds: IoUs that a detection must exceed.
-        class_names: of the labels.
-        **kwargs: see ``torchmetrics.Metric``.
+        **kwargs: see ``ObjectMetric``.
 
     Raises:
         ConfigError: there is no such form of boxes, no threshold, or one that is no share.
@@ -80,7 +79,6 @@ class MeanAveragePrecision(ObjectMetric):
         *,
         boxes: str = "oriented",
         iou_thresholds: Sequence[float] = IOU_THRESHOLDS,
-        class_names: Sequence[str] = CLASSES,
         **kwargs: Any,
     ) -> None:
         super().__init__(**kwargs)
@@ -92,7 +90,6 @@ class MeanAveragePrecision(ObjectMetric):
             )
         self.boxes = boxes
         self.iou_thresholds = tuple(iou_thresholds)
-        self.class_names = tuple(class_names)
         # Label; of an object the highest IoU with a detection of its class, of a detection the score; then
         # whether it is found or right, at each threshold.
         self.truth_columns = self.prediction_columns = 2 + len(self.iou_thresholds)
@@ -120,7 +117,7 @@ class MeanAveragePrecision(ObjectMetric):
     def compute(self) -> dict[str, Any]:
         """Return average precision and recall at each threshold, by class and in the mean, and counts."""
         records = self.scenes_by_name()
-        rankings = class_rankings(records, self.class_names)
+        rankings = class_rankings(records, self.classes.names)
         every = np.arange(len(records))
         result: dict[str, Any] = {
             "boxes": self.boxes,
@@ -147,7 +144,7 @@ class MeanAveragePrecision(ObjectMetric):
         rows: list[Row] = []
         for index, (label, best, *found) in enumerate(record.truths.tolist()):
             row: Row = {"scene_id": record.scene_id, "object": index}
-            row |= {"category": self.class_names[int(label)], "best_iou": best}
+            row |= {"category": self.classes.names[int(label)], "best_iou": best}
             rows.append(row | self._by_threshold("matched", [bool(value) for value in found]))
         return rows
 

@@ -107,7 +107,8 @@ class ObjectMetric(SceneMetric):
 
     def __init__(self, *, classes: Classes | Mapping[str, Any] | None = None, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.classes = Classes.of(classes)
+        # Boxes that are only compared may have classes that no network has.
+        self.classes = classes if isinstance(classes, Classes) else Classes.of(classes)
 
     @abstractmethod
     def judge(self, predictions: Any, targets: Any) -> tuple[Tensor, Tensor]:

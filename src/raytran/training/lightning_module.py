@@ -39,6 +39,7 @@ class Reconstruction(pl.LightningModule):
         compiled: run the model through ``torch.compile``. What is compiled is the function, not the module,
             so that weights keep their names.
         metrics: validation scores besides ours, by name, see ``SceneScores``.
+        map_boxes: with mean average precision among the validation scores, see ``SceneScores``.
     """
 
     def __init__(
@@ -50,13 +51,16 @@ class Reconstruction(pl.LightningModule):
         optimization: Optimization,
         compiled: bool = False,
         metrics: Mapping[str, Metric] | None = None,
+        map_boxes: str | None = None,
     ) -> None:
         super().__init__()
         self.model = model
         self.loss = loss
         self.stage = stage
         self.optimization = optimization
-        self.scores = SceneScores(tasks=stage.tasks, metrics=metrics, classes=model.classes)
+        self.scores = SceneScores(
+            tasks=stage.tasks, map_boxes=map_boxes, metrics=metrics, classes=model.classes
+        )
         self._compiled = torch.compile(model.forward) if compiled else None
         self._val_losses: dict[str, MeanMetric] = {}
         self._gradient_norms: dict[str, Tensor] | None = None

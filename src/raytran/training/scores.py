@@ -11,6 +11,7 @@ from torch import nn
 from torchmetrics import Metric
 
 from raytran.classes import PAPER_CLASSES, Classes
+from raytran.metrics.average_precision import MeanAveragePrecision, threshold_name
 from raytran.metrics.box_f1 import OrientedBoxF1
 from raytran.metrics.new_views import NewViewScores
 from raytran.metrics.occupancy_iou import ForegroundIoU, SceneOccupancyIoU
@@ -33,6 +34,8 @@ class SceneScores(nn.Module):
         duplicate_iou: nor does one that overlaps a surer one of its class by more than this IoU.
         volume_extent: size of the voxel grid, metres; given, the results also tell why objects are missed
             (``ErrorAtlas``) and how many would be found at other thresholds (``AccuracyCurves``).
+        map_boxes: with the mean average precision of boxes that are ``oriented`` or ``axis_aligned``
+            (``MeanAveragePrecision``), of predictions of every score; None: without.
         metrics: further ones by name, e.g. of your own: ``update(batch, predictions)`` gets what ``update``
             here gets, objects of every score among it, and ``compute()`` returns one number. None for none.
         classes: of the objects.
@@ -45,19 +48,22 @@ class SceneScores(nn.Module):
         score_threshold: float = SCORE_THRESHOLD,
         duplicate_iou: float | None = DUPLICATE_IOU,
         volume_extent: Sequence[float] | None = None,
+        map_boxes: str | None = None,
         metrics: Mapping[str, Metric] | None = None,
         classes: Classes = PAPER_CLASSES,
     ) -> None:
         super().__init__()
         self._score_threshold = score_threshold
         self._duplicate_iou = duplicate_iou
-        self.strict = self.box_f1_of_all = None
+        self.strict = self.box_f1_of_all = self.mean_average_precision = None
         if "objects" in tasks:
             self.strict = StrictScores(
                 explain=volume_extent is not None, volume_extent=volume_extent, classes=classes
             )
             # Predictions of every score, to tell which threshold would have been the best.
             self.box_f1_of_all = OrientedBoxF1(classes=classes)
+            if map_boxes is not None:
+                self.mean_average_precision = MeanAveragePrecision(boxes=map_boxes, classes=classes)
         self.shape = MatchedShapeScores(classes=classes) if "shape" in tasks else None
         self.occupancy = SceneOccupancyIoU() if "occupancy" in tasks else None
         self.foreground = ForegroundIoU() if "foreground" in tasks else None
@@ -69,7 +75,10 @@ class SceneScores(nn.Module):
         if self.strict is not None and self.box_f1_of_all is not None and batch.objects is not None:
             counted = self._objects(predictions, self._score_threshold)
             self.strict.update(counted, batch.objects, batch.scene_id, list(batch.grid_center))
-            self.box_f1_of_all.update(self._objects(predictions, 0.0), batch.objects, batch.scene_id)
+            every = self._objects(predictions, 0.0)
+            self.box_f1_of_all.update(every, batch.objects, batch.scene_id)
+            if self.mean_average_precision is not None:
+                self.mean_average_precision.update(every, batch.objects, batch.scene_id)
         for index, prediction in enumerate(predictions):
             names = [batch.scene_id[index]]
             occupancy, foreground = prediction.occupancy, prediction.foreground
@@ -109,6 +118,8 @@ class SceneScores(nn.Module):
             for threshold, scores in self.box_f1_of_all.compute()["per_threshold"].items():
                 of_threshold = results["strict"]["per_threshold"][threshold]
                 of_threshold |= {name: value for name, value in scores.items() if name in _OF_ALL_SCORES}
+        if self.mean_average_precision is not None:
+            results["map"] = self.mean_average_precision.compute()
         if self.occupancy is not None:
             results["occupancy_iou"] = self.occupancy.compute().item()
         if self.foreground is not None:
@@ -138,6 +149,12 @@ class SceneScores(nn.Module):
                 for name, entry in values["per_class"].items():
                     if entry["n_true"]:
                         numbers[f"objects/f1_{threshold}/{name}"] = entry["f1"]
+        if self.mean_average_precision is not None:
+            for threshold in self.mean_average_precision.iou_thresholds:
+                of_threshold = results["map"][threshold_name(threshold)]
+                numbers[f"objects/map_{threshold:g}"] = of_threshold["mean"]
+                for name, value in of_threshold["per_class"].items():
+                    numbers[f"objects/map_{threshold:g}/{name}"] = value
         for task in ("occupancy", "foreground"):
             if f"{task}_iou" in results:
                 numbers[f"{task}/iou"] = results[f"{task}_iou"]
@@ -150,7 +167,14 @@ class SceneScores(nn.Module):
         """Return a row for each scene or true object, the columns of the object metrics side by side."""
         if self.strict is None:
             return []
-        return side_by_side(per, self.strict.accuracy, self.strict.box_f1, self.shape, self.strict.atlas)
+        rows = side_by_side(per, self.strict.accuracy, self.strict.box_f1, self.shape, self.strict.atlas)
+        if self.mean_average_precision is None:
+            return rows
+        of_map = self.mean_average_precision.rows(per)
+        return [
+            {**row, **{f"map_{name}": value for name, value in other.items() if "matched" in name}}
+            for row, other in zip(rows, of_map, strict=True)
+        ]
 
     def new_view_rows(self) -> list[Row]:
         """Return a row for each new view."""
@@ -158,7 +182,7 @@ class SceneScores(nn.Module):
 
     def reset(self) -> None:
         """Forget all scenes."""
-        objects = (self.strict, self.box_f1_of_all, self.shape)
+        objects = (self.strict, self.box_f1_of_all, self.mean_average_precision, self.shape)
         for metric in (*objects, self.occupancy, self.foreground, self.new_views, *self.metrics.values()):
             if metric is not None:
                 metric.reset()

@@ -123,3 +123,19 @@ def test_scenes_with_few_objects_are_chosen():
     assert with_at_most(None, scenes) is scenes
     with pytest.raises(ConfigError, match="choose a larger max_objects"):
         with_at_most(2, scenes)
+
+
+def test_mean_average_precision_beside_strict(tmp_path):
+    batch = scene()
+    model = Oracle(replace(batch.objects[0], shape=None, score=torch.tensor([0.9, 0.8, 0.3])))
+    evaluation = evaluate_model(model, [batch], map_boxes="oriented", progress=False)
+    write_evaluation(tmp_path / "out", evaluation)
+    metrics = evaluation.metrics
+    assert metrics["strict"]["n_good"] == 2
+    assert metrics["map"]["iou_0.5"]["per_class"] == {"chair": 1.0, "table": 1.0}  # sees every score
+    assert metrics["map"]["confidence"]["map_0.5"] == {"value": 1.0, "low": 1.0, "high": 1.0}
+    with (tmp_path / "out" / "per_object.csv").open() as file:
+        assert [row["map_matched_0.5"] for row in csv.DictReader(file)] == ["True"] * 3
+    console = Console(width=100, record=True)
+    console.print(*result_tables(evaluation, title="t"))
+    assert "oriented boxes" in console.export_text()

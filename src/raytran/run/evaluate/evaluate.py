@@ -28,7 +28,7 @@ from raytran.model import RayTran
 from raytran.postprocess import DUPLICATE_IOU, SCORE_THRESHOLD
 from raytran.run.device import choose_device, set_matmul_precision
 from raytran.run.entry import compose, typed_settings
-from raytran.run.evaluate.results import MARKER, Evaluation, read_curves, result_tables, write_evaluation
+from raytran.run.evaluate.results import MAP, MARKER, Evaluation, read_curves, result_tables, write_evaluation
 from raytran.run.evaluate.score import ProtocolScores, confidence, evaluate_predictions
 from raytran.run.output import one_writer
 from raytran.run.train.build import build_data, plain
@@ -40,6 +40,9 @@ _log = logging.getLogger(__name__)
 
 TASKS = ("objects", "occupancy", "foreground")
 TASKS_WITH_SHAPE = (*TASKS, "shape")
+PROTOCOLS_OF_CHECKPOINTS = ("strict", MAP)
+"""What ``protocol`` may be with a checkpoint; ``strict`` is always told."""
+
 TASKS_OF_STAGE = {"stage3": TASKS_WITH_SHAPE, "novel_view": ("view",)}
 """What checkpoints of a stage are asked for, if not for ``TASKS``: the others leave shapes untrained."""
 
@@ -75,12 +78,16 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
 def _of_files(cfg: DictConfig) -> tuple[Evaluation, str]:
     """Return the scores of ``predictions=`` and what was measured."""
     if cfg.annotations is None:
-        raise ConfigError("predictions= needs annotations=FILE, Scan2CAD's full_annotations.json")
+        raise ConfigError(
+            "predictions= needs annotations=FILE, Scan2CAD's full_annotations.json, or with protocol=map a "
+            "folder of true boxes"
+        )
     paths = {name: None if cfg[name] is None else Path(cfg[name]) for name in ("compare", "split", "scans")}
     evaluation = evaluate_predictions(
         Path(cfg.predictions),
         Path(cfg.annotations),
         cfg.protocol,
+        boxes=cfg.boxes,
         compare_with=paths["compare"],
         split=paths["split"],
         scans=paths["scans"],
@@ -94,6 +101,9 @@ def _of_files(cfg: DictConfig) -> tuple[Evaluation, str]:
 
 def _of_checkpoint(cfg: DictConfig) -> tuple[Evaluation, str]:
     """Return the scores of ``checkpoint=`` and what was measured."""
+    if cfg.protocol not in PROTOCOLS_OF_CHECKPOINTS:
+        known = " or ".join(PROTOCOLS_OF_CHECKPOINTS)
+        raise ConfigError(f"protocol={cfg.protocol} is for predictions=, with checkpoint= choose {known}")
     settings = prediction_settings(cfg.checkpoint)
     device = choose_device(cfg.device)
     set_matmul_precision(cfg.matmul_precision, device)
@@ -116,6 +126,7 @@ def _of_checkpoint(cfg: DictConfig) -> tuple[Evaluation, str]:
         num_resamples=cfg.num_resamples,
         seed=cfg.seed,
         metrics=instantiate(cfg.metrics, _convert_="all"),
+        map_boxes=cfg.boxes if cfg.protocol == MAP else None,
         about=about_data(data, split, cfg.views.num_views)
         | {"checkpoint": str(cfg.checkpoint), "max_objects": cfg.max_objects},
     )
@@ -207,6 +218,7 @@ def evaluate_model(
     num_resamples: int = 2000,
     seed: int = 0,
     metrics: Mapping[str, Metric] | None = None,
+    map_boxes: str | None = None,
     about: Mapping[str, Any] | None = None,
     progress: bool = True,
 ) -> Evaluation:
@@ -223,12 +235,14 @@ def evaluate_model(
         num_resamples: draws of the bootstrap.
         seed: of the bootstrap.
         metrics: further ones by name, see ``SceneScores``.
+        map_boxes: also follow protocol ``map``, with which boxes, see ``SceneScores``.
         about: what to say beside the numbers, e.g. the checkpoint.
         progress: show a progress bar.
 
     Returns:
         per protocol (``strict``) what ``Scan2CADAccuracy`` and ``OrientedBoxF1`` return, with ``confidence``
-        intervals, the accuracy ``by_scene_size``, the ``curves`` and the error ``atlas``; ``occupancy_iou``,
+        intervals, the accuracy ``by_scene_size``, the ``curves`` and the error ``atlas``; ``map`` with
+        ``confidence`` intervals if it is asked for; ``occupancy_iou``,
         ``foreground_iou``, under ``shape`` what ``MatchedShapeScores`` returns, under ``new_views`` what
         ``NewViewScores`` does, each of ``metrics`` by its name, and what ``about`` says.
     """
@@ -240,6 +254,7 @@ def evaluate_model(
         volume_extent=model.grid_extent,
         metrics=metrics,
         classes=model.classes,
+        map_boxes=map_boxes,
     ).to(device)
     model.eval()
     forward_tasks = [task for task in tasks if task != "shape"]  # shapes are decoded of chosen objects alone
@@ -264,6 +279,9 @@ def evaluate_model(
         return Evaluation({**(about or {}), **results}, {"per_view.csv": scores.new_view_rows()})
     strict = ProtocolScores(results["strict"], scores.rows("object"), scores.rows("scene"))
     strict.metrics["confidence"] = confidence(strict, num_resamples=num_resamples, seed=seed)
+    if scores.mean_average_precision is not None:
+        of_map = ProtocolScores(results[MAP], [], [], scores.mean_average_precision)
+        of_map.metrics["confidence"] = confidence(of_map, num_resamples=num_resamples, seed=seed)
     settings = {"score_threshold": score_threshold, "duplicate_iou": duplicate_iou}
     return Evaluation(
         {**(about or {}), **settings, **results},

@@ -26,6 +26,10 @@ MARKER = "metrics.json"
 """The file that tells a finished result."""
 
 PROTOCOLS: tuple[str, ...] = ("strict", "scan2cad", "vid2cad", "odam")
+"""Those that compare with Scan2CAD's annotations, side by side if asked for."""
+
+MAP = "map"
+"""The protocol that compares boxes of any classes, by mean average precision."""
 
 _PLAIN: dict[str, Any] = {"box": box.SIMPLE_HEAD, "pad_edge": False, "collapse_padding": True}
 _CAPTION = escape("[low–high]: 95 % of bootstrap draws of the scenes")
@@ -149,7 +153,10 @@ def result_tables(evaluation: Evaluation, *, title: str) -> Iterator[Table]:
     if "new_views" in metrics:
         yield _new_views_table(metrics["new_views"], title)
         return
-    yield _scores_table(metrics, title)
+    if any(name in metrics for name in PROTOCOLS):
+        yield _scores_table(metrics, title)
+    if MAP in metrics:
+        yield _map_table(metrics[MAP], title)
     if "strict" in metrics:
         yield _atlas_table(metrics["strict"]["atlas"])
     if evaluation.compared_with is not None:
@@ -190,6 +197,30 @@ def _scores_table(metrics: Mapping[str, Any], title: str) -> Table:
         table.add_row(f"IoU of {shape['n_matched']} found objects' shapes", f"{shape['iou']:.3f}")
         if shape["chamfer_distance"] is not None:
             table.add_row("chamfer distance of these", f"{100 * shape['chamfer_distance']:.1f} cm")
+    return table
+
+
+def _map_table(scores: Mapping[str, Any], title: str) -> Table:
+    """Return average precision and recall by class, as papers print them."""
+    thresholds = [name for name in scores if name.startswith("iou_")]
+    columns = [f"{what} @ {name.removeprefix('iou_')}" for name in thresholds for what in ("AP", "AR")]
+    boxes = "oriented boxes" if scores["boxes"] == "oriented" else "axis-aligned boxes"
+    shown = f"{title}: {scores['n_scenes']} scenes, {boxes}"
+    table = Table("class", *columns, "true", "detected", title=escape(shown), caption=_CAPTION, **_PLAIN)
+    for category, n_true in scores["n_true"].items():
+        cells = [
+            f"{scores[name][of][category]:.1%}"
+            for name in thresholds
+            for of in ("per_class", "recall_per_class")
+        ]
+        table.add_row(escape(category), *cells, str(n_true), str(scores["n_predicted"][category]))
+    table.add_section()
+    means = []
+    for name in thresholds:
+        means += [f"{scores[name]['mean']:.1%} {_interval(scores, name.replace('iou', 'map'))}"]
+        means += [f"{scores[name]['mean_recall']:.1%}"]
+    totals = (sum(scores[count].values()) for count in ("n_true", "n_predicted"))
+    table.add_row("mean", *means, *map(str, totals))
     return table
 
 
@@ -244,7 +275,7 @@ def _comparison_rows(comparison: Mapping[str, Any]) -> Iterator[tuple[str, ...]]
         for number, entry in numbers.items():
             yield (
                 protocol,
-                _AVERAGES.get(number, number.replace("f1_", "F1 @ ")),
+                _AVERAGES.get(number, number.replace("f1_", "F1 @ ").replace("map_", "mAP @ ")),
                 *(f"{entry[side]:.1%}" for side in ("first", "second")),
                 f"{entry['difference']:+.1%} "
                 + escape(f"[{100 * entry['low']:+.1f}, {100 * entry['high']:+.1f}]"),

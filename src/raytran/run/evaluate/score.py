@@ -7,7 +7,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from torch import Tensor
@@ -18,31 +18,43 @@ from raytran.data.scannet.scan import read_scan
 from raytran.data.scene_list import annotated_objects
 from raytran.data.text import read_names
 from raytran.errors import ConfigError, DataError
-from raytran.export.read import CadBoxes, PredictionFiles, read_predictions
+from raytran.export.read import (
+    CadBoxes,
+    PredictionFiles,
+    files_by_scene,
+    read_named_boxes,
+    read_predictions,
+)
+from raytran.metrics.average_precision import MeanAveragePrecision, mean_of_draws
 from raytran.metrics.bootstrap import (
     Comparison,
     Counts,
     Interval,
+    OfScenes,
     Statistic,
     bootstrap_interval,
     class_average,
     class_counts,
     compare_paired,
+    comparison_of_scenes,
     f1,
     global_average,
+    interval_of_scenes,
 )
 from raytran.metrics.box_f1 import OrientedBoxF1
 from raytran.metrics.functional.cad_errors import cad_symmetries
-from raytran.metrics.per_scene import Row, check_protocol_classes
+from raytran.metrics.per_scene import Row, SceneRecord, check_protocol_classes
 from raytran.metrics.scan2cad import Scan2CADAccuracy
 from raytran.metrics.strict import StrictScores, side_by_side
-from raytran.run.evaluate.results import PROTOCOLS, Evaluation
+from raytran.run.evaluate.results import MAP, PROTOCOLS, Evaluation
 from raytran.structs import CadAlignments, ObjectSet
 
 _log = logging.getLogger(__name__)
 
 ALL_PROTOCOLS = "all"
 _NEEDS_CADS = ("scan2cad", "vid2cad")
+
+_Scene = TypeVar("_Scene", SceneAnnotation, Path)
 
 
 @dataclass(frozen=True)
@@ -53,11 +65,13 @@ class ProtocolScores:
         metrics: the part of ``metrics.json`` under the protocol's name.
         objects: a row for each annotated object that counts.
         scenes: a row for each scene that counts.
+        of_map: what judged them by protocol ``map``; its numbers follow from no sum over scenes.
     """
 
     metrics: dict[str, Any]
     objects: list[Row]
     scenes: list[Row]
+    of_map: MeanAveragePrecision | None = None
 
     def misses(self) -> list[Row]:
         """Return the rows of the objects that protocol ``strict`` counts as missed."""
@@ -66,13 +80,23 @@ class ProtocolScores:
 
 @dataclass(frozen=True)
 class Truth:
-    """The annotated scenes that are asked for, in the forms that the protocols compare."""
+    """The annotated scenes that are asked for, in the forms that the protocols compare.
+
+    Attributes:
+        objects: boxes by scene.
+        alignments: CAD alignments by scene; empty if the annotations are a folder of boxes.
+        cad_boxes: of each CAD model.
+        volume_center: ``(3,)`` centre of each scene's voxel grid, where it is known.
+        classes: of the objects; those that occur, in a folder of boxes.
+        only_boxes: the annotations are such a folder.
+    """
 
     objects: dict[str, ObjectSet]
     alignments: dict[str, CadAlignments]
     cad_boxes: CadBoxes
     volume_center: dict[str, Tensor]
     classes: Classes = PAPER_CLASSES
+    only_boxes: bool = False
 
 
 def evaluate_predictions(
@@ -80,6 +104,7 @@ def evaluate_predictions(
     annotations: Path,
     protocol: str = "strict",
     *,
+    boxes: str = "oriented",
     compare_with: Path | None = None,
     split: Path | None = None,
     scans: Path | None = None,
@@ -92,8 +117,10 @@ def evaluate_predictions(
 
     Args:
         predictions: folder or file, see ``read_predictions``.
-        annotations: Scan2CAD's ``full_annotations.json``.
-        protocol: ``strict``, ``scan2cad``, ``vid2cad``, ``odam``, or ``all`` of them that apply.
+        annotations: Scan2CAD's ``full_annotations.json``; for ``map`` also a folder of true boxes, see
+            ``read_truth``.
+        protocol: ``strict``, ``scan2cad``, ``vid2cad``, ``odam``, or ``all`` of these that apply; or ``map``.
+        boxes: of ``map``, see ``MeanAveragePrecision``.
         compare_with: other predictions for the same scenes.
         split: text file of the scenes that were asked for; None: all annotated ones.
         scans: ScanNet's ``scans`` folder, whose cameras tell where the voxel grid was.
@@ -110,7 +137,7 @@ def evaluate_predictions(
         DataError: a file is missing or damaged.
     """
     truth = read_truth(annotations, split=split, scans=scans, classes=classes)
-    files, scores = _scores_by_protocol(protocol, predictions, truth, volume_extent)
+    files, scores = _scores_by_protocol(protocol, predictions, truth, boxes, volume_extent)
     paths = {"predictions": predictions, "annotations": annotations, "split": split}
     metrics: dict[str, Any] = {name: None if path is None else str(path) for name, path in paths.items()}
     metrics |= files.counts()
@@ -119,7 +146,7 @@ def evaluate_predictions(
         metrics[name] = of_protocol.metrics | {"confidence": intervals}
     compared_curves = None
     if compare_with is not None:
-        _, others = _scores_by_protocol(protocol, compare_with, truth)
+        _, others = _scores_by_protocol(protocol, compare_with, truth, boxes)
         metrics["comparison"] = {
             name: compare(scores[name], others[name], num_resamples=num_resamples, seed=seed)
             for name in scores
@@ -139,8 +166,18 @@ def evaluate_predictions(
 
 
 def _scores_by_protocol(
-    protocol: str, path: Path, truth: Truth, volume_extent: Sequence[float] | None = None
+    protocol: str, path: Path, truth: Truth, boxes: str, volume_extent: Sequence[float] | None = None
 ) -> tuple[PredictionFiles, dict[str, ProtocolScores]]:
+    if protocol == MAP:
+        files = read_predictions(
+            path, truth.objects, truth.cad_boxes, truth.classes, leave_out_others=True
+        )
+        return files, {MAP: _score_map(files, truth, boxes)}
+    if truth.only_boxes and protocol in (*PROTOCOLS, ALL_PROTOCOLS):
+        raise ConfigError(
+            f"protocol={protocol} compares with Scan2CAD's full_annotations.json: give that as annotations=, "
+            f"or protocol={MAP} for a folder of boxes"
+        )
     files = read_predictions(path, truth.objects, truth.cad_boxes, truth.classes)
     protocols = choose_protocols(protocol, files, path, truth.classes)
     return files, {
@@ -158,7 +195,9 @@ def read_truth(
     """Read the annotated scenes.
 
     Args:
-        annotations: Scan2CAD's ``full_annotations.json``.
+        annotations: Scan2CAD's ``full_annotations.json``, or a folder of true boxes of any classes, in the
+            forms of predictions that name classes: ``<scene_id>.json`` (``raytran.scene/1``, whose scores do
+            not matter and may be missing), or Boxer's CSV.
         split: text file of scene names, one a line; None: all scenes of the annotations.
         scans: folder of ScanNet scans, whose cameras tell where each voxel grid was; None: unknown.
         classes: that objects are of; others are no ``objects``.
@@ -166,6 +205,8 @@ def read_truth(
     Raises:
         DataError: a file is missing or damaged, or no scene of the split is annotated.
     """
+    if annotations.is_dir():
+        return _truth_of_boxes(annotations, split)
     scenes = read_annotations(annotations)
     chosen = _of_split(scenes, split, annotations)
     centers = {} if scans is None else {name: _volume_center(scans / name) for name in chosen}
@@ -182,9 +223,19 @@ def read_truth(
     )
 
 
-def _of_split(
-    scenes: Mapping[str, SceneAnnotation], split: Path | None, annotations: Path
-) -> dict[str, SceneAnnotation]:
+def _truth_of_boxes(folder: Path, split: Path | None) -> Truth:
+    """Read a folder of true boxes; their classes are those that occur, in the order of their names."""
+    files = _of_split(files_by_scene(folder), split, folder)
+    scenes = {name: read_named_boxes(path, name, scored=False, flat=True) for name, path in files.items()}
+    names = tuple(sorted({category for scene in scenes.values() for category in scene.category}))
+    if not names:
+        raise DataError(f"{folder} holds no true boxes: name the files <scene_id>.json (raytran.scene/1)")
+    classes = Classes(names)
+    objects = {name: scene.labelled(classes) for name, scene in scenes.items()}
+    return Truth(objects, {}, {}, {}, classes, only_boxes=True)
+
+
+def _of_split(scenes: Mapping[str, _Scene], split: Path | None, annotations: Path) -> dict[str, _Scene]:
     if split is None:
         return dict(scenes)
     names = set(read_names(split))
@@ -209,7 +260,7 @@ def choose_protocols(
             predictions do not name.
     """
     if protocol not in (*PROTOCOLS, ALL_PROTOCOLS):
-        known = ", ".join((*PROTOCOLS, ALL_PROTOCOLS))
+        known = ", ".join((*PROTOCOLS, ALL_PROTOCOLS, MAP))
         raise ConfigError(f"unknown protocol={protocol}, choose one of: {known}")
     if classes.names != PAPER_CLASSES.names:
         if protocol not in ("strict", ALL_PROTOCOLS):
@@ -259,16 +310,7 @@ def score_protocol(
 def _score_strict(
     files: PredictionFiles, truth: Truth, volume_extent: Sequence[float] | None
 ) -> ProtocolScores:
-    names, targets = list(truth.objects), list(truth.objects.values())
-    num_missing = sum(name not in files.scenes for name in names)
-    if num_missing:
-        _log.warning(
-            "%d of %d scenes have no predictions, and count as scenes in which nothing was found; name the "
-            "scenes that were asked for with split=FILE",
-            *(num_missing, len(names)),
-        )
-    predicted = {name: scene.objects for name, scene in files.scenes.items()}
-    predictions = [predicted.get(name, ObjectSet.empty()) for name in names]
+    names, predictions, targets = _every_scene(files, truth)
     scores = StrictScores(volume_extent=volume_extent, classes=truth.classes)
     scores.update(predictions, targets, names, [truth.volume_center.get(name) for name in names])
     return ProtocolScores(
@@ -278,8 +320,35 @@ def _score_strict(
     )
 
 
+def _score_map(files: PredictionFiles, truth: Truth, boxes: str) -> ProtocolScores:
+    names, predictions, targets = _every_scene(files, truth)
+    metric = MeanAveragePrecision(boxes=boxes, classes=truth.classes)
+    metric.update(predictions, targets, names)
+    return ProtocolScores(metric.compute(), metric.rows("object"), metric.rows("scene"), metric)
+
+
+def _every_scene(files: PredictionFiles, truth: Truth) -> tuple[list[str], list[ObjectSet], list[ObjectSet]]:
+    """Return names, predictions and true objects of all scenes; a line tells how many have no predictions."""
+    names, targets = list(truth.objects), list(truth.objects.values())
+    num_missing = sum(name not in files.scenes for name in names)
+    if num_missing:
+        _log.warning(
+            "%d of %d scenes have no predictions, and count as scenes in which nothing was found; name the "
+            "scenes that were asked for with split=FILE",
+            *(num_missing, len(names)),
+        )
+    predicted = {name: scene.objects for name, scene in files.scenes.items()}
+    return names, [predicted.get(name, ObjectSet.empty()) for name in names], targets
+
+
 def confidence(scores: ProtocolScores, *, num_resamples: int, seed: int) -> dict[str, Interval]:
     """Return the 95 % intervals of a protocol's main numbers over its scenes."""
+    if scores.of_map is not None:
+        records = scores.of_map.scenes_by_name()
+        return {
+            name: interval_of_scenes(of_scenes, len(records), num_resamples=num_resamples, seed=seed)
+            for name, of_scenes in _means_of_draws(scores.of_map, records).items()
+        }
     names = [str(row["scene_id"]) for row in scores.scenes]
     return {
         number: bootstrap_interval(
@@ -296,6 +365,13 @@ def compare(
     first: ProtocolScores, second: ProtocolScores, *, num_resamples: int, seed: int
 ) -> dict[str, Comparison]:
     """Compare two sets of predictions under one protocol, on the scenes that count for both."""
+    if first.of_map is not None and second.of_map is not None:
+        own = first.of_map.scenes_by_name()
+        both = [*own, *second.of_map.scenes_by_name()]  # of the same scenes: each counts for both sides
+        return {
+            name: comparison_of_scenes(of_rows, len(own), num_resamples=num_resamples, seed=seed)
+            for name, of_rows in _means_of_draws(first.of_map, both).items()
+        }
     others = {row["scene_id"] for row in second.scenes}
     names = [str(row["scene_id"]) for row in first.scenes if row["scene_id"] in others]
     classes = sorted({*_classes(first), *_classes(second)})
@@ -308,6 +384,14 @@ def compare(
             seed=seed,
         )
         for number, statistic in _statistics(first).items()
+    }
+
+
+def _means_of_draws(metric: MeanAveragePrecision, records: Sequence[SceneRecord]) -> dict[str, OfScenes]:
+    """Return the mean average precision at each threshold as a function of drawn scenes, by name."""
+    return {
+        f"map_{threshold:g}": mean_of_draws(records, metric.classes.names, column)
+        for column, threshold in enumerate(metric.iou_thresholds)
     }
 
 

@@ -74,6 +74,7 @@ def build_module(cfg: DictConfig, model: RayTran) -> Reconstruction:
         optimization=instantiate(cfg.optimizer, _convert_="all"),
         compiled=does_compile(cfg.compile),
         metrics=instantiate(cfg.get("metrics", {}), _convert_="all"),
+        map_boxes=cfg.get("map_boxes"),
     )
 
 
