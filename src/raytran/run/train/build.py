@@ -19,6 +19,7 @@ from raytran.checkpoints.runs import LAST
 from raytran.errors import ConfigError
 from raytran.run.path_settings import without_references
 from raytran.run.train.settings import RunConfig, does_compile
+from raytran.training.callbacks.averaged_weights import AveragedWeights
 from raytran.training.callbacks.health import Health
 from raytran.training.callbacks.last_checkpoint import BestCheckpoint, LastCheckpoint
 from raytran.training.callbacks.run_checks import EffectiveBatch, RankAgreement, RepeatedFramesWarning
@@ -133,6 +134,7 @@ def build_trainer(
         RepeatedFramesWarning(),
         LastCheckpoint(folder / LAST, every_n_steps=run.checkpoint_every, metadata=metadata),
         *_monitors(cfg, folder, metadata["config"]),
+        *_averaged_weights(cfg),
         *_judges(cfg, folder),
     ]
     settings["enable_checkpointing"] = any(isinstance(callback, ModelCheckpoint) for callback in callbacks)
@@ -150,6 +152,20 @@ def build_trainer(
         enable_progress_bar=run.progress_bar == "tqdm",
         _convert_="all",
     )
+
+
+def _averaged_weights(cfg: DictConfig) -> list[pl.Callback]:
+    """Return the callback that averages the weights, if there is to be one.
+
+    Raises:
+        ConfigError: the decay is no share.
+    """
+    decay = cfg.ema.decay
+    if decay is None:
+        return []
+    if isinstance(decay, bool) or not isinstance(decay, int | float) or not 0 < decay < 1:
+        raise ConfigError(f"ema.decay must be above 0 and below 1, or null for no average, got {decay}")
+    return [AveragedWeights(decay=decay)]
 
 
 def _judges(cfg: DictConfig, folder: Path) -> list[pl.Callback]:

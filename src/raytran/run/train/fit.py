@@ -27,6 +27,7 @@ from raytran.data.files import write_json, write_text
 from raytran.errors import CheckpointError, ConfigError
 from raytran.run.device import cudnn_warning, set_matmul_precision
 from raytran.run.train.build import build_data, build_model, build_module, build_trainer, plain
+from raytran.run.train.learning_rate import find_learning_rate
 from raytran.run.train.memory import explained_out_of_memory
 from raytran.run.train.parent import find_parent, stages_after
 from raytran.run.train.rank_processes import rank_processes
@@ -44,6 +45,8 @@ _log = logging.getLogger(__name__)
 
 CONFIG = "config.yaml"
 """File with all settings of a run, in its folder."""
+
+_RATE = "optimizer.learning_rate"
 
 RANDOM_ENCODER = (
     "IMAGE ENCODER STARTS FROM RANDOM WEIGHTS: model.backbone.encoder.weights=auto found no ImageNet weights"
@@ -91,6 +94,8 @@ def _train(cfg: DictConfig, run: RunConfig, folder: Path) -> FitResult:
     """Train what is left to train."""
     pl.seed_everything(run.seed, workers=True, verbose=False)
     _quiet()
+    if cfg.lr_find:
+        cfg = _with_found_learning_rate(cfg, run)
     config = plain(cfg)
     start = _start(cfg, run)
     module = start.module
@@ -136,6 +141,24 @@ def _train(cfg: DictConfig, run: RunConfig, folder: Path) -> FitResult:
     metrics = {name: float(value) for name, value in trainer.logged_metrics.items()}
     _log.info("%s finished after %.0f s: %s", module.stage.name, seconds, folder / LAST)
     return FitResult(folder, folder / LAST, trainer.global_step, seconds, metrics)
+
+
+def _with_found_learning_rate(cfg: DictConfig, run: RunConfig) -> DictConfig:
+    """Return the settings with a learning rate that was searched for, or that a resumed run has found before.
+
+    The run that follows is the one with that rate typed, to the last bit.
+    """
+    found = _to_continue(run)
+    before = (
+        None if found is None else OmegaConf.select(OmegaConf.create(found[1].get("config") or {}), _RATE)
+    )
+    if before is None:
+        start = _start(cfg, run)
+        before = find_learning_rate(cfg, start.module, start.stage)
+        pl.seed_everything(run.seed, workers=True, verbose=False)
+    cfg = cfg.copy()
+    OmegaConf.update(cfg, _RATE, float(before))
+    return cfg
 
 
 def _finished_before(run: RunConfig, folder: Path, *, steps: int) -> FitResult | None:

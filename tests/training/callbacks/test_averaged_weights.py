@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The moving average of the weights in runs, against one that is computed from what was trained."""
+
+from __future__ import annotations
+
+import os
+import signal
+
+import pytest
+import torch
+
+from raytran.checkpoints.file import BEST_NAME
+from raytran.checkpoints.load import load_model
+from raytran.checkpoints.runs import LAST
+from raytran.errors import ConfigError
+from raytran.rooms.generate import generate_rooms
+from raytran.run.entry import compose
+from raytran.run.train.fit import train
+from raytran.training.callbacks.averaged_weights import TRAINED
+from raytran.training.lightning_module import Reconstruction
+
+DECAY = 0.6
+
+
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rooms")
+    generate_rooms(
+        folder,
+        num_train=1,
+        num_val=1,
+        frames=4,
+        image_size=(32, 32),
+        min_objects=3,
+        max_objects=3,
+        room_size=((3.0, 3.5), (3.0, 3.5)),
+        processes=1,
+        progress=False,
+    )
+    return [
+        *("preset=tiny", f"data.root={folder}", "trainer=cpu", "experiment=stage1", "progress_bar=none"),
+        *("views.image_size=[32,32]", "views.num_views=2", "views.predict_views=2", "watch.pictures=0"),
+        *("model.grid_resolution=[8,8,4]", "trainer.max_steps=5", "trainer.val_check_interval=2"),
+        *("checkpoint_every=2", "schedule.log_every=1", "resume=auto"),
+    ]
+
+
+def fit(settings, folder, *more):
+    train(compose("train", [*settings, f"output_dir={folder}", *more]))
+    return torch.load(folder / LAST, weights_only=True)
+
+
+@pytest.fixture
+def seen(monkeypatch):
+    """The weights before each step, and those that each validation scores."""
+    found = {"steps": [], "validations": []}
+
+    def watch(hook, key):
+        original = getattr(Reconstruction, hook)
+
+        def watched(self, batch, batch_idx):
+            if key == "steps" or batch_idx == 0:
+                found[key].append({name: value.clone() for name, value in self.state_dict().items()})
+            return original(self, batch, batch_idx)
+
+        monkeypatch.setattr(Reconstruction, hook, watched)
+
+    watch("training_step", "steps")
+    watch("validation_step", "validations")
+    return found
+
+
+def averages(states):
+    """The average after each state but the first, which it begins with."""
+    average = {name: value.double() for name, value in states[0].items() if value.is_floating_point()}
+    found = []
+    for step, state in enumerate(states[1:], start=1):
+        kept = min(DECAY, (1 + step) / (10 + step))
+        average = {name: kept * value + (1 - kept) * state[name].double() for name, value in average.items()}
+        found.append(average)
+    return found
+
+
+def assert_close(state, expected):
+    for name, value in expected.items():
+        torch.testing.assert_close(state[name].double(), value, rtol=1e-5, atol=1e-7, msg=name)
+
+
+def test_the_average_is_scored_kept_and_handed_on(settings, tmp_path, seen):
+    with_average = fit(settings, tmp_path / "a", f"ema.decay={DECAY}")
+    states, scored = list(seen["steps"]), list(seen["validations"])
+    seen["steps"].clear()
+    without = fit(settings, tmp_path / "b")
+    # The steps are those of a run without an average, to the last bit.
+    for ours, theirs in zip(states, seen["steps"], strict=True):
+        assert all(torch.equal(ours[name], value) for name, value in theirs.items())
+    assert TRAINED not in without
+    trained = with_average[TRAINED]
+    assert all(torch.equal(trained[name], without["state_dict"][name]) for name in trained)
+    after = averages([*states, without["state_dict"]])
+    assert len(scored) == 2
+    assert_close(scored[0], after[1])
+    assert_close(scored[1], after[3])
+    assert_close(with_average["state_dict"], after[4])
+    assert any(not torch.equal(with_average["state_dict"][name], value) for name, value in trained.items())
+    best = torch.load((tmp_path / "a" / LAST).with_name(BEST_NAME), weights_only=True)
+    assert_close(best["state_dict"], after[best["global_step"] - 1])
+    model = load_model(tmp_path / "a" / LAST)
+    state = {f"model.{name}": value for name, value in model.state_dict().items()}
+    assert_close(state, {name: value for name, value in after[4].items() if name in state})
+
+
+def send_at(monkeypatch, hook, call):
+    original, calls = getattr(Reconstruction, hook), []
+
+    def counted(*arguments, **named):
+        calls.append(None)
+        if len(calls) == call:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return original(*arguments, **named)
+
+    monkeypatch.setattr(Reconstruction, hook, counted)
+
+
+@pytest.fixture(scope="module")
+def straight(settings, tmp_path_factory):
+    """The end of a run that nobody stopped."""
+    return fit(settings, tmp_path_factory.mktemp("straight"), f"ema.decay={DECAY}")
+
+
+@pytest.mark.parametrize(("hook", "call"), [("training_step", 3), ("validation_step", 1)])
+def test_a_run_that_was_stopped_ends_as_one_that_was_not(
+    settings, straight, tmp_path, monkeypatch, hook, call
+):
+    """Between two steps, and in a validation, when the network has the average."""
+    given = [*settings, f"ema.decay={DECAY}"]
+    with monkeypatch.context() as context:
+        send_at(context, hook, call)
+        with pytest.raises(SystemExit):
+            fit(given, tmp_path / "run")
+    resumed = fit(given, tmp_path / "run")
+    for key in ("state_dict", TRAINED):
+        assert resumed[key].keys() == straight[key].keys()
+        assert all(torch.equal(resumed[key][name], value) for name, value in straight[key].items())
+    assert resumed["scores"] == straight["scores"]
+
+
+def test_a_finished_run_goes_on_from_what_it_trained(settings, straight, tmp_path):
+    given = [*settings, f"ema.decay={DECAY}"]
+    fit(given, tmp_path / "run", "trainer.max_steps=3")
+    longer = fit(given, tmp_path / "run")
+    for key in ("state_dict", TRAINED):
+        assert all(torch.equal(longer[key][name], value) for name, value in straight[key].items())
+
+
+def test_steps_that_are_skipped_leave_the_average_finite(settings, tmp_path, monkeypatch, seen):
+    original, calls = Reconstruction.training_step, []
+
+    def spoiled(self, batch, batch_idx):
+        calls.append(None)
+        outcome = original(self, batch, batch_idx)
+        return outcome | {"loss": outcome["loss"] * float("nan")} if len(calls) == 3 else outcome
+
+    monkeypatch.setattr(Reconstruction, "training_step", spoiled)
+    found = fit(settings, tmp_path, f"ema.decay={DECAY}")
+    states = seen["steps"]
+    parameters = [name for name in states[0] if "running" not in name and "batches" not in name]
+    assert all(torch.equal(states[2][name], states[3][name]) for name in parameters)
+    last = {**found["state_dict"], **found[TRAINED]}
+    assert_close(found["state_dict"], averages([*states, last])[4])
+
+
+@pytest.mark.parametrize("decay", ["0", "1", "1.5", "high", "true"])
+def test_a_decay_that_is_no_share(settings, tmp_path, decay):
+    with pytest.raises(ConfigError, match=r"ema\.decay must be above 0 and below 1, or null"):
+        fit(settings, tmp_path, f"ema.decay={decay}")
