@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Loggers of runs that are stopped and resumed: a CSV table, TensorBoard, Weights & Biases."""
+"""Loggers of runs that are stopped and resumed: a CSV table, TensorBoard, Weights & Biases, MLflow."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlparse
 
-from lightning.pytorch.loggers import Logger, TensorBoardLogger
+from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 
 from raytran.data.files import write_text
@@ -28,6 +28,7 @@ _log = logging.getLogger(__name__)
 
 METRICS = "metrics.csv"
 WANDB_ID = "wandb-id.txt"
+MLFLOW_ID = "mlflow-id.txt"
 
 _OFFLINE = ("offline", "dryrun")
 """Values of WANDB_MODE with which W&B keeps to this machine; the second is its former name."""
@@ -313,6 +314,103 @@ def wandb_logger(*, project: str, name: str, save_dir: str) -> Any:
         id=ids[-1],
         resume=None if offline else "allow",
     )
+
+
+class ContinuedMLFlow(MLFlowLogger):
+    """One MLflow run for a whole run, also after a resume: its id is kept in ``mlflow-id.txt``.
+
+    MLflow forgets no value: steps that a resumed run does again have two. Where its store cannot be written
+    or reached, that is said once and the run goes on.
+
+    Args:
+        folder: of the run.
+        **settings: see Lightning's logger.
+    """
+
+    def __init__(self, *, folder: Path, **settings: Any) -> None:
+        self._id_file = folder / MLFLOW_ID
+        known = self._id_file.read_text(encoding="utf-8").strip() if self._id_file.is_file() else ""
+        super().__init__(run_id=known or None, **settings)
+        self._is_continued = bool(known)
+        self._is_failure_told = False
+
+    @rank_zero_only
+    def log_hyperparams(self, params: Any) -> None:
+        """Log the settings of a new run: MLflow lets nobody change them."""
+        with self._told_once():
+            if not self._is_continued:
+                super().log_hyperparams(params)
+            if not self._id_file.is_file():
+                write_text(self._id_file, f"{self.run_id}\n")
+
+    @rank_zero_only
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Log values."""
+        with self._told_once():
+            super().log_metrics(metrics, step)
+
+    @rank_zero_only
+    def log_pictures(self, pictures: Mapping[str, Path], step: int) -> None:
+        """Keep pictures of a step as artifacts.
+
+        Args:
+            pictures: files by name, ``<scene>/masks`` and so on.
+            step: of the run.
+        """
+        with self._told_once():
+            for name, path in pictures.items():
+                folder = f"pictures/step-{step:06d}/{name.rpartition('/')[0]}"
+                self.experiment.log_artifact(self.run_id, str(path), folder)
+
+    @rank_zero_only
+    def finalize(self, status: str = "success") -> None:
+        """Mark the run as ended."""
+        with self._told_once():
+            super().finalize(status)
+
+    @contextmanager
+    def _told_once(self) -> Iterator[None]:
+        from mlflow.exceptions import MlflowException
+
+        try:
+            yield
+        except (OSError, MlflowException) as error:
+            if not self._is_failure_told:
+                reason = str(error).partition("\n")[0]
+                _log.warning("MLflow is not told everything (%s); training goes on", reason)
+            self._is_failure_told = True
+
+
+def mlflow_logger(*, experiment: str, name: str, save_dir: str, store: str) -> Any:
+    """Return a logger to the MLflow server of MLFLOW_TRACKING_URI, else to ``<store>/mlflow.db``.
+
+    The runs of a sweep or a curriculum have its name as their tag ``group``.
+
+    Raises:
+        ConfigError: the package is not installed.
+    """
+    folder = Path(save_dir)
+    group, job = group_and_job(folder)
+    settings: dict[str, Any] = {}
+    if not os.environ.get("MLFLOW_TRACKING_URI"):
+        root = Path(store).absolute()
+        root.mkdir(parents=True, exist_ok=True)
+        settings["tracking_uri"] = f"sqlite:///{root / 'mlflow.db'}"
+        settings["artifact_location"] = (root / "mlflow").as_uri()
+    else:
+        settings["tracking_uri"] = os.environ["MLFLOW_TRACKING_URI"]
+    try:
+        return ContinuedMLFlow(
+            folder=folder,
+            experiment_name=experiment,
+            run_name=" ".join(word for word in (name, job) if word),
+            tags={} if group is None else {"group": group},
+            **settings,
+        )
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            "MLflow is not installed: pip install 'raytran[mlflow]', or choose another logger="
+        ) from error
 
 
 def group_and_job(folder: Path) -> tuple[str | None, str]:

@@ -23,6 +23,7 @@ from raytran.pictures.scene_pictures import draw_scene
 from raytran.postprocess import DUPLICATE_IOU, SCORE_THRESHOLD, select_objects
 from raytran.structs import SceneBatch, ScenePrediction
 from raytran.training.lightning_module import Reconstruction
+from raytran.training.loggers import ContinuedMLFlow
 
 _log = logging.getLogger(__name__)
 
@@ -70,6 +71,8 @@ class ScenePictures(pl.Callback):
                     _log_tensorboard(logger, pictures, logged_at)
             elif isinstance(logger, WandbLogger):
                 _log_wandb(logger, pictures, found, logged_at, grid_extent)
+            elif isinstance(logger, ContinuedMLFlow):
+                logger.log_pictures(pictures, step)
 
     @torch.no_grad()
     def _predict(self, module: Reconstruction, dataset: Any) -> list[tuple[SceneBatch, ScenePrediction]]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import lightning.pytorch as pl
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
+from lightning.pytorch.loggers import MLFlowLogger, TensorBoardLogger, WandbLogger
 
 from raytran.training.loggers import was_logged_step
 
@@ -111,3 +111,5 @@ class RunSettings(pl.Callback):
                 logger.log_hyperparams(self._settings, scores, step=trainer.global_step)
             elif isinstance(logger, WandbLogger) and score is not None:
                 logger.experiment.summary[HP_METRIC] = float(score)
+            elif isinstance(logger, MLFlowLogger) and score is not None:
+                logger.log_metrics({HP_METRIC: float(score)}, trainer.global_step)
