@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import signal
+from types import SimpleNamespace
 
+import lightning.pytorch as pl
 import pytest
 import torch
 
@@ -16,7 +19,7 @@ from raytran.errors import ConfigError
 from raytran.rooms.generate import generate_rooms
 from raytran.run.entry import compose
 from raytran.run.train.fit import train
-from raytran.training.callbacks.averaged_weights import TRAINED
+from raytran.training.callbacks.averaged_weights import TRAINED, AveragedWeights
 from raytran.training.lightning_module import Reconstruction
 
 DECAY = 0.6
@@ -174,3 +177,36 @@ def test_steps_that_are_skipped_leave_the_average_finite(settings, tmp_path, mon
 def test_a_decay_that_is_no_share(settings, tmp_path, decay):
     with pytest.raises(ConfigError, match=r"ema\.decay must be above 0 and below 1, or null"):
         fit(settings, tmp_path, f"ema.decay={decay}")
+
+
+def averaged_on_rank(rank, folder):
+    """Save what a rank of two has: norms of its own statistics, weights that are the same on both."""
+    torch.distributed.init_process_group("gloo", f"file://{folder}/meet", rank=rank, world_size=2)
+    module = pl.LightningModule()
+    module.norm = torch.nn.BatchNorm1d(1)
+    callback, trainer = AveragedWeights(decay=DECAY), SimpleNamespace(global_step=0)
+    callback.on_train_start(trainer, module)
+    for trainer.global_step in (1, 2, 3):
+        module.norm.weight.data += 1
+        module.norm.running_mean += 1 + rank
+        callback.on_train_batch_end(trainer, module, None, None, 0)
+    checkpoint = {"state_dict": module.state_dict()}
+    callback.on_save_checkpoint(trainer, module, checkpoint)
+    checkpoint = copy.deepcopy(checkpoint)
+    callback.on_validation_start(trainer, module)
+    torch.save([checkpoint, module.state_dict()], f"{folder}/{rank}.pt")
+    torch.distributed.destroy_process_group()
+
+
+def test_two_ranks_have_one_average(tmp_path):
+    processes = torch.multiprocessing.start_processes
+    processes(averaged_on_rank, (str(tmp_path),), nprocs=2, start_method="fork")
+    (first, scored), (second, other) = (torch.load(tmp_path / f"{rank}.pt") for rank in (0, 1))
+    # After steps 1, 2 and 3 the average keeps 2/11, 3/12 and 4/13 of itself; the norm's mean is that of both.
+    weight = (1 - 4 / 13) * 4 + 4 / 13 * ((1 - 3 / 12) * 3 + 3 / 12 * ((1 - 2 / 11) * 2 + 2 / 11))
+    assert first["state_dict"]["norm.weight"].item() == pytest.approx(weight)
+    assert first["state_dict"]["norm.running_mean"].item() == pytest.approx(1.5 * (weight - 1))
+    assert (first[TRAINED]["norm.weight"].item(), first[TRAINED]["norm.running_mean"].item()) == (4, 3)
+    assert second[TRAINED]["norm.running_mean"].item() == 6
+    for found in (second["state_dict"], scored, other):
+        assert all(torch.equal(found[name], value) for name, value in first["state_dict"].items())
