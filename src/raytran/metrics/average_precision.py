@@ -86,7 +86,7 @@ class MeanAveragePrecision(ObjectMetric):
             raise ConfigError(f"unknown boxes={boxes}, choose one of: {', '.join(BOX_FORMS)}")
         if not iou_thresholds or not all(0 <= threshold < 1 for threshold in iou_thresholds):
             raise ConfigError(
-                f"iou_thresholds={list(iou_thresholds)} must be shares below 1, e.g. [0.25, 0.5]"
+                f"IoU thresholds must be shares below 1, e.g. [0.25, 0.5], got {list(iou_thresholds)}"
             )
         self.boxes = boxes
         self.iou_thresholds = tuple(iou_thresholds)
