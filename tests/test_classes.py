@@ -136,3 +136,13 @@ def test_a_class_that_is_not_there() -> None:
 def test_as_many_colours_as_classes() -> None:
     with pytest.raises(ConfigError, match="colors has 1 entries for 2 names"):
         Classes(("a", "b"), colors=((1, 2, 3),))
+
+
+def test_boxes_that_are_only_compared_may_have_any_words_for_classes() -> None:
+    words = ("tv/monitor", "_misc", "$5 lamp", "x" * 100)
+    assert Classes(words).names == words
+    for settings in (Classes(words), {"names": list(words)}):
+        with pytest.raises(ConfigError, match="cannot be the name of a class"):
+            Classes.of(settings)
+    with pytest.raises(ConfigError, match="printable"):
+        Classes(("a\nb",))

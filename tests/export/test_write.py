@@ -106,7 +106,8 @@ def test_a_mesh_or_a_name_is_missing(tmp_path, prediction, cameras):
         ),
         ('{"format": "other"}', "has format 'other'"),
         (
-            '{"format": "raytran.scene/1", "scene_id": "a", "objects": [{"category": "ship"}]}',
+            '{"format": "raytran.scene/1", "scene_id": "a", "objects": [{"category": "ship", "score": 1, '
+            '"center": [0, 0, 0], "size": [1, 1, 1], "rotation": [[1, 0, 0], [0, 0, -1], [0, 1, 0]]}]}',
             "category 'ship'",
         ),
     ],

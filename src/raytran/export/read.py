@@ -138,9 +138,7 @@ class NamedBoxes:
         place = {name: label for label, name in enumerate(classes.names)}
         other = next((name for name in self.category if name not in place), None)
         if other is not None and not leave_out_others:
-            raise DataError(
-                f"{self.path} has an object of category {shown(other)}: choose one of {classes}"
-            )
+            raise DataError(f"{self.path} has an object of category {shown(other)}: choose one of {classes}")
         label = torch.tensor([place.get(name, -1) for name in self.category], dtype=torch.int64)
         return replace(self.objects, label=label, classes=classes).select(label >= 0)
 

@@ -374,7 +374,11 @@ def test_header_row_and_empty_line(files):
         ("csv/c.json", scene_json("c", box("chair", [0, 0, 0], [1, 1, 1e300])), "line 8: a number is not"),
         ("csv/c.json", scene_json("c", box("chair", [0, 0, 0], [10**400, 1, 1])), "line 8: a number is not"),
         ("csv/c.json", scene_json("c", box("chair", [0, 0, "0"], [1, 1, 1])), "center of the objects in"),
-        ("csv/c.json", scene_json("c", box(["chair"], [0, 0, 0], [1, 1, 1])), "category \\['chair'\\]"),
+        (
+            "csv/c.json",
+            scene_json("c", box(["chair"], [0, 0, 0], [1, 1, 1])),
+            r"category of an object in .* is \['chair'\]",
+        ),
         ("csv/a.csv", row(CHAIR, "c1", (1e300, 0, 0)), r"tx in line 1 of .*a\.csv is 1e\+300"),
         ("csv/a.csv", row(CHAIR, "c1", (0, 0, 0), scale=(1e300, 1, 1)), "sx in line 1"),
         ("csv/a.csv", row(CHAIR, "c1", (0, 0, 0), scale=(1e-300, 1, 1)), r"a\.csv, line 1: a scale"),

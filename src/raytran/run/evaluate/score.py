@@ -169,9 +169,7 @@ def _scores_by_protocol(
     protocol: str, path: Path, truth: Truth, boxes: str, volume_extent: Sequence[float] | None = None
 ) -> tuple[PredictionFiles, dict[str, ProtocolScores]]:
     if protocol == MAP:
-        files = read_predictions(
-            path, truth.objects, truth.cad_boxes, truth.classes, leave_out_others=True
-        )
+        files = read_predictions(path, truth.objects, truth.cad_boxes, truth.classes, leave_out_others=True)
         return files, {MAP: _score_map(files, truth, boxes)}
     if truth.only_boxes and protocol in (*PROTOCOLS, ALL_PROTOCOLS):
         raise ConfigError(
