@@ -212,7 +212,7 @@ class ObjectSet(TensorStruct):
         score: ``(M,)`` confidence in [0, 1]; ones for ground truth.
         shape: ``(M, S, S, S)`` or None, occupancy over the object's own box, indexed [x, y, z] in the object
             frame; cell ``i`` spans ``[i/S - ½, (i+1)/S - ½] · size``. bool for ground truth, probability
-            in [0, 1] for predictions.
+            in [0, 1] for predictions. A true shape without any cell is not known: only its box is.
         model_id: ``catid/id`` of each object's CAD model, or empty.
         num_views: ``(M,)`` how many views saw each object's box, the mean over the box; None if not counted.
         classes: what the labels stand for.

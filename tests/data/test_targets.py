@@ -21,7 +21,7 @@ from raytran.data.scannet.scan import read_scan
 from raytran.data.shapenet.meshes import read_binvox
 from raytran.data.shapenet.models import read_mesh
 from raytran.data.shapenet.voxelize import voxelize_solid
-from raytran.data.targets import _scan_surface, foreground_masks, scene_occupancy, shape_grids
+from raytran.data.targets import foreground_masks, scan_surface, scene_occupancy, shape_grids
 from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
@@ -201,7 +201,9 @@ class TestShapes:
         (corner,) = shape_grids(("03001627/corner",), **options)
         made = []
         monkeypatch.setattr(
-            targets, "voxelize_solid", lambda *mesh, size: made.append(1) or voxelize_solid(*mesh, size=size)
+            targets,
+            "voxelize_solid",
+            lambda *mesh, **options: made.append(1) or voxelize_solid(*mesh, **options),
         )
         names = ("03001627/cube", "03001627/corner", "03001627/cube")
         shapes = shape_grids(names, **options)
@@ -315,4 +317,4 @@ def test_a_scans_mesh_of_points_that_are_nowhere_is_refused(tmp_path, height, co
         f"0 0 0\n1 0 0\n0 {height} 0\n3 0 1 {corner}\n"
     )
     with pytest.raises(DataError, match=r"mesh\.ply"):
-        _scan_surface(path, "")
+        scan_surface(path, "")

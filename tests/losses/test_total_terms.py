@@ -10,9 +10,10 @@ from raytran.structs import Views
 
 def test_mean_over_cells_sum_over_objects() -> None:
     target = torch.zeros(2, 3, 3, 3, dtype=torch.bool)
+    target[:, 1, 1, 1] = True
     logits = torch.zeros(2, 3, 3, 3)
     assert float(shape_loss(logits, target, num_objects=torch.tensor(1.0))) == pytest.approx(2 * 0.6931472)
-    logits[1] = -30.0
+    logits[1] = torch.where(target[1], 30.0, -30.0)
     assert float(shape_loss(logits, target, num_objects=torch.tensor(2.0))) == pytest.approx(0.6931472 / 2)
 
 
@@ -35,3 +36,16 @@ def test_a_mask_channel_is_no_colour_and_16_bits_suffice() -> None:
     loss = view_loss(logits, with_mask)
     assert loss.dtype == torch.float32
     torch.testing.assert_close(loss, torch.tensor(0.25))
+
+
+def test_shapes_that_are_not_known_count_nothing(generator):
+    logits = torch.randn(3, 5, 5, 5, generator=generator)
+    target = torch.rand(3, 5, 5, 5, generator=generator) > 0.5
+    target[1] = False
+    count = torch.tensor(2.0)
+    loss = shape_loss(logits, target, num_objects=count)
+    torch.testing.assert_close(loss, shape_loss(logits[[0, 2]], target[[0, 2]], num_objects=count))
+    logits.requires_grad_()
+    shape_loss(logits, target, num_objects=count).backward()
+    assert not logits.grad[1].any()
+    assert logits.grad[0].any()

@@ -131,3 +131,12 @@ def test_missing_and_unlike_shapes():
         MatchedShapeScores().update([replace(truth, shape=None)], [truth], ["a"])
     with pytest.raises(ShapeError, match="one size"):
         MatchedShapeScores().update([replace(truth, shape=torch.ones(1, 4, 4, 4))], [truth], ["a"])
+
+
+def test_an_object_whose_shape_is_not_known_is_not_compared():
+    full = block((0, 0, 0), (8, 8, 8))
+    truth = make_objects([full, torch.zeros_like(full)], [1, 1])
+    metric = MatchedShapeScores()
+    metric.update([replace(truth, shape=torch.stack([full, full]))], [truth], ["a"])
+    result = metric.compute()
+    assert (result["n_matched"], result["iou"]) == (1, 1.0)

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from raytran.data.augment import Augmentation
+from raytran.errors import DataError
 from raytran.run.entry import compose
 from raytran.run.train.build import build_data
 from raytran.training.datamodule import SceneDataModule
@@ -26,6 +27,13 @@ class Scenes:
         return item
 
 
+class Boxes(Scenes):
+    """Scenes of whose objects nothing but the boxes is known."""
+
+    def has_shapes(self):
+        return False
+
+
 def make_data(monkeypatch, tmp_path, **options):
     monkeypatch.setattr("raytran.training.datamodule.collate_scenes", lambda samples: list(samples))
     return SceneDataModule(
@@ -41,6 +49,17 @@ def test_every_epoch_brings_every_scene_in_another_order(monkeypatch, tmp_path):
         assert {found for found, _ in order} == {epoch}
         assert sorted(index for _, index in order) == [0, 1, 2, 3, 4]
     assert len({tuple(index for _, index in order) for order in orders}) > 1
+
+
+def test_shapes_are_not_learned_of_boxes(monkeypatch, tmp_path):
+    data = make_data(monkeypatch, tmp_path)
+    data._dataset = Boxes
+    assert data.train_dataloader() is not None
+    data._targets = ("shapes",)
+    with pytest.raises(DataError, match=r"no object in .* has a shape to learn, only boxes are known: train"):
+        data.train_dataloader()
+    # Scores of the boxes are wanted all the same.
+    assert data.val_dataloader() is not None
 
 
 def test_a_checkpoint_holds_the_place_in_the_stream(monkeypatch, tmp_path):

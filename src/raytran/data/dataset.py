@@ -28,6 +28,7 @@ from raytran.data.scene_list import (
     choose_scenes,
     read_split,
 )
+from raytran.data.shapenet.models import has_own_shape
 from raytran.data.targets import (
     foreground_masks,
     scene_occupancy,
@@ -165,6 +166,10 @@ class SceneDataset(Dataset[SceneBatch]):
         """Return how many objects scene ``index`` has, without reading the scene."""
         return len(self._objects_of[index])
 
+    def has_shapes(self) -> bool:
+        """Return whether of any object more than the box is known, without reading a scene."""
+        return any(has_own_shape(name) for i in range(len(self)) for name in self._objects_of[i].model_id)
+
     def __getitem__(self, item: int | tuple[int, int]) -> SceneBatch:
         """Return a scene with B = 1.
 
@@ -191,7 +196,8 @@ class SceneDataset(Dataset[SceneBatch]):
         (objects,) = scene.objects or (ObjectSet.empty(self.classes),)
         targets = None
         if self._targets & {"objects", "shapes"}:
-            targets = (self._target_objects(objects, is_seen, scene.grid_center),)
+            known = _with_known_shapes(objects, self._objects_of[index].model_id)
+            targets = (self._target_objects(known, is_seen, scene.grid_center),)
         return replace(
             scene,
             objects=targets,
@@ -395,3 +401,16 @@ def _hold_out_views(scene: SceneBatch, seen: Sequence[int], rendered: Sequence[i
         frame_id=tuple(tuple(names[position] for position in seen) for names in scene.frame_id),
         foreground=None if scene.foreground is None else scene.foreground[:, list(seen)],
     )
+
+
+def _with_known_shapes(objects: ObjectSet, model_ids: Sequence[str]) -> ObjectSet:
+    """Return the objects; of those of which only the box is known the shapes are empty: no target.
+
+    Args:
+        objects: M of them, as augmentation left them.
+        model_ids: ``catid/id`` of each.
+    """
+    is_known = torch.tensor([has_own_shape(name) for name in model_ids], dtype=torch.bool)
+    if objects.shape is None or bool(is_known.all()):
+        return objects
+    return replace(objects, shape=objects.shape & is_known[:, None, None, None])

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from raytran.data.cache import MaskCache, digest, file_digest
-from raytran.data.shapenet.models import mesh_path, read_mesh
+from raytran.data.shapenet.models import is_boxed, mesh_path, read_mesh
 from raytran.data.shapenet.voxelize import voxelize_solid
 from raytran.errors import DataError
 from raytran.geometry.camera import Cameras
@@ -30,12 +30,15 @@ MAX_SURFACE_OFFSET = 0.2
 """Depth by which the scan's surface may be nearer than the CAD model aligned to it, metres: the error that
 Scan2CAD's benchmark allows."""
 
+_UNIT_BOX = (-0.5, 0.5)
+"""Of a boxed model, along each axis."""
+
 _VERSION = 1
 """Part of every key; raise it when the way a target is computed changes."""
 
 
 def shape_grids(model_ids: tuple[str, ...], *, shapenet_root: Path, cache: MaskCache) -> Tensor:
-    """Return the solid shape of each CAD model over its own box.
+    """Return the solid shape of each CAD model over its own box; of a boxed one over the object's.
 
     Args:
         model_ids: ``catid/id`` of M models.
@@ -57,7 +60,9 @@ def shape_grids(model_ids: tuple[str, ...], *, shapenet_root: Path, cache: MaskC
         if first < i:
             grids[i] = grids[first]
         else:
-            grids[i] = voxelize_solid(*_unit_mesh(shapenet_root, model_ids[i], contents[i]), size=SHAPE_SIZE)
+            box = _UNIT_BOX if is_boxed(shapenet_root, *model_ids[i].split("/")) else None
+            mesh = _unit_mesh(shapenet_root, model_ids[i], contents[i])
+            grids[i] = voxelize_solid(*mesh, size=SHAPE_SIZE, box=box)
             cache.write("shape", keys[i], grids[i])
     return torch.from_numpy(grids)
 
@@ -154,7 +159,7 @@ def visible_masks(
 
     def draw(missing: Cameras) -> NDArray[np.bool_]:
         meshes = cad_meshes(objects, shapenet_root=shapenet_root)
-        scan = _scan_surface(scan_mesh, content)
+        scan = scan_surface(scan_mesh, content)
         return rasterize_visible(meshes, [scan], missing, tolerance=MAX_SURFACE_OFFSET).numpy()
 
     key = digest(MAX_SURFACE_OFFSET, content, _scene_key(objects, shapenet_root))
@@ -218,7 +223,7 @@ def _cached_per_camera(
 
 
 @lru_cache(maxsize=2)
-def _scan_surface(path: Path, _content: str) -> tuple[NDArray, NDArray]:
+def scan_surface(path: Path, _content: str) -> tuple[NDArray, NDArray]:
     """Return vertices ``(V, 3)`` and faces ``(F, 3)`` of a scan's mesh, in the world of its poses.
 
     Raises:
@@ -258,9 +263,12 @@ def _content(shapenet_root: Path, model_id: str) -> str:
 def _unit_mesh(shapenet_root: Path, model_id: str, _content: str) -> tuple[NDArray, NDArray]:
     """Return vertices and faces of a CAD model, its box stretched to the cube [-½, ½]³.
 
-    The box is that of the vertices which faces use, as in Scan2CAD's annotation.
+    The box is that of the vertices which faces use, as in Scan2CAD's annotation. A boxed model comes in such
+    a cube: it may leave parts of it empty.
     """
     mesh = read_mesh(shapenet_root, *model_id.split("/"))
+    if is_boxed(shapenet_root, *model_id.split("/")):
+        return np.asarray(mesh.vertices, dtype=np.float64).clip(*_UNIT_BOX), np.asarray(mesh.faces)
     used, faces = np.unique(mesh.faces, return_inverse=True)
     vertices = np.asarray(mesh.vertices, dtype=np.float64)[used]
     low, high = vertices.min(axis=0), vertices.max(axis=0)

@@ -32,11 +32,12 @@ def shape_loss(logits: Tensor, target: Tensor, *, num_objects: Tensor) -> Tensor
 
     Args:
         logits: ``(M, S, S, S)``.
-        target: ``(M, S, S, S)`` bool.
+        target: ``(M, S, S, S)`` bool; without any cell, the shape is not known and counts nothing.
         num_objects: scalar.
     """
     entropy = F.binary_cross_entropy_with_logits(logits.float(), target.float(), reduction="none")
-    return entropy.flatten(1).mean(dim=1).sum() / num_objects
+    is_known = target.flatten(1).any(dim=1)
+    return (entropy.flatten(1).mean(dim=1) * is_known).sum() / num_objects
 
 
 def view_loss(logits: Tensor, target: Views) -> Tensor:

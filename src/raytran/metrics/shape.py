@@ -70,7 +70,7 @@ class MatchedShapeScores(ObjectMetric):
         allowed = alignment_errors(predictions, targets).within(*SCAN2CAD_LIMITS)
         allowed &= predictions.label[:, None] == targets.label
         for taker, taken in enumerate(match_in_order(score_order(predictions.score), allowed).tolist()):
-            if taken >= 0:
+            if taken >= 0 and true[taken].any():
                 size, shapes = targets.size[taken], (predicted[taker], true[taken])
                 distance = chamfer_distance(*(surface_points(shape, size) for shape in shapes))
                 table[taken, 1:] = table.new_tensor([1.0, grid_iou(*shapes), distance])

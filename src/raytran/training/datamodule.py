@@ -21,6 +21,7 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler
 from raytran.data.augment import Augmentation
 from raytran.data.collate import collate_scenes
 from raytran.data.workers import become_worker
+from raytran.errors import DataError
 from raytran.setting_limits import check_settings
 from raytran.structs import SceneBatch, TensorStruct
 from raytran.training.scene_stream import SceneStream
@@ -128,6 +129,11 @@ class SceneDataModule(pl.LightningDataModule):
     def train_dataloader(self) -> DataLoader[SceneBatch]:
         """Return the training scenes without end, in an order that changes every epoch."""
         dataset = self.split("train", training=True)
+        if "shapes" in self._targets and not getattr(dataset, "has_shapes", lambda: True)():
+            raise DataError(
+                f"no object in {self.root} has a shape to learn, only boxes are known: train stages 1 and 2 "
+                "alone, or prepare the data with the scans' meshes"
+            )
         stream = SceneStream(
             dataset,
             **self._ranks(),

@@ -6,7 +6,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from raytran.data.scannet.text import are_rigid, check_intrinsics, read_header, read_intrinsics, read_matrix
+from raytran.data.scannet.text import (
+    are_rigid,
+    check_intrinsics,
+    read_frame_cameras,
+    read_header,
+    read_intrinsics,
+    read_matrix,
+)
 from raytran.errors import DataError
 
 from ...scan_forms import INTRINSICS, look_along_x
@@ -101,3 +108,31 @@ def test_a_stated_size_that_fits_better_than_the_stored_one(tmp_path, header, fi
     else:
         with pytest.raises(DataError, match=r"principal point at \(27\.0, 18\.0\).*than the stored 48x32"):
             check_intrinsics(matrix, tmp_path / "k.txt", image_size=(32, 48), header=header)
+
+
+def test_a_camera_of_each_frame(tmp_path):
+    path = tmp_path / "frames.txt"
+    path.write_text("a b\t10 11 5 4\n2\t20 21 6 4\n")
+    matrices, picture = read_frame_cameras(path, ["2", "a b"])
+    assert matrices[:, [0, 1, 0, 1], [0, 1, 2, 2]].tolist() == [[20, 21, 6, 4], [10, 11, 5, 4]]
+    assert picture is None
+    path.write_text("1\t10 11 5 4 0 2 10 8\n")
+    assert read_frame_cameras(path, ["1"])[1].tolist() == [[0, 2, 10, 8]]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("1 10 11 5 4", "has the line"),
+        ("1\t10 11 5", "no frame with its camera"),
+        ("1\t10 11 5 x", "has 'x' where a number is needed"),
+        ("1\t0 11 5 4", "a focal length in"),
+        ("1\t10 11 5 inf", "a pixel in"),
+        ("2\t10 11 5 4", "has no line for frame 1"),
+        ("1\t10 11 5 4 3 0 3 8", "shows nothing of its image"),
+    ],
+)
+def test_damaged_cameras_of_frames(tmp_path, text, said):
+    (tmp_path / "frames.txt").write_text(text)
+    with pytest.raises(DataError, match=said):
+        read_frame_cameras(tmp_path / "frames.txt", ["1"])

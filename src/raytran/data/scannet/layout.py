@@ -44,6 +44,9 @@ _INTRINSICS = (
 """Files of intrinsics: ScanNet's tools write the first and the last, users of 7-Scenes and the demo of TSDF
 fusion the others."""
 
+FRAME_CAMERAS = "intrinsic/frames.txt"
+"""File with a camera for each frame, which preparation writes where lenses or pictures differ."""
+
 _DEPTH_INTRINSICS = ("intrinsic/intrinsic_depth.txt", "intrinsics/intrinsic_depth.txt", "intrinsic_depth.txt")
 
 _IMAGE_ENDINGS = IMAGE_ENDINGS[::-1]
@@ -138,6 +141,11 @@ class Layout:
         folders = [self.base, self.scan, *([] if self.is_aligned else [self.scan.absolute().parent])]
         paths = (folder / name for folder in dict.fromkeys(folders) for name in _INTRINSICS)
         return next((path for path in paths if path.is_file()), self.base / _INTRINSICS[0])
+
+    def frame_cameras(self) -> Path | None:
+        """Return the file with a camera for each frame, None if all frames have the same."""
+        path = self.base / FRAME_CAMERAS
+        return path if path.is_file() else None
 
     def depth_intrinsics(self) -> Path | None:
         """Return the file of the depth camera's intrinsics, None if there is none."""

@@ -47,6 +47,7 @@ from raytran.data.scannet.text import (
     fits_better,
     header_intrinsics,
     pose_faults,
+    read_frame_cameras,
     read_header,
     read_intrinsics,
     read_pose,
@@ -207,6 +208,8 @@ def read_scan(
     # Of pictures on their side, intrinsics may be for those that an EXIF orientation turns upright.
     is_shown = fits_better(matrix, common.shown_size, common.size)
     found = [each if each is None else each.shown_size if is_shown else each.size for each in headers]
+    per_frame = layout.frame_cameras() if intrinsics is None else None
+    any_size = any_size or per_frame is not None
     image_size, of_all = _fitting_size(
         [size for size in found if size is not None],
         partial(check_intrinsics, matrix, intrinsics_file, header=facts, any_size=any_size),
@@ -219,6 +222,10 @@ def read_scan(
             dropped[name] = TURNED if is_turned(size, image_size) else OTHER_SHAPE
     names = list(compress(names, fits))
     sizes = [size for size in sizes if has_shape(size, image_size)]
+    # In images of one aspect, brought to one size, all have the same, unless a file says otherwise.
+    of_each, picture = of_all.expand(len(names), 3, 3), None
+    if per_frame is not None:
+        of_each, picture = read_frame_cameras(per_frame, names)
     paths = tuple(images[name] for name in names)
     return Scan(
         scene_id=folder.name,
@@ -227,8 +234,8 @@ def read_scan(
         image_path=paths,
         tags=orientation_tags(list(compress(headers, fits)), applied=True) if is_shown else None,
         world_from_camera=torch.from_numpy(poses[[fault is None for fault in faults]][fits]),
-        # In images of one aspect, brought to one size, all have the same.
-        intrinsics=of_all.expand(len(names), 3, 3),
+        intrinsics=of_each,
+        picture=picture,
         image_size=image_size,
         other_size={i: size for i, size in enumerate(sizes) if size != image_size},
         axis_alignment=axis_alignment(facts, header),

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,11 @@ from torch import Tensor
 
 from raytran.data.images import is_turned
 from raytran.data.scan import EMPTY, LEFT_HANDED, LOST, SCALED, SKEWED
-from raytran.data.text import read_table
+from raytran.data.text import read_table, read_text
 from raytran.errors import DataError
 from raytran.geometry.camera import FARTHEST_CENTER, center_offset, other_image_size
 from raytran.geometry.checks import rigid_motions
-from raytran.limits import FOCAL_LENGTH, POSITION
+from raytran.limits import FOCAL_LENGTH, PIXEL, POSITION, as_numbers, shown
 
 INFO_FILES = ("_info.txt", "info.txt")
 """Names of the C++ exporter's file of facts."""
@@ -141,6 +142,53 @@ def read_intrinsics(path: Path) -> NDArray[np.float64]:
             "intrinsics=fx,fy,cx,cy"
         )
     return matrix
+
+
+def read_frame_cameras(path: Path, names: Sequence[str]) -> tuple[Tensor, Tensor | None]:
+    """Read the name of a frame, a tab, and ``fx fy cx cy [left top right bottom]``, a line for each frame.
+
+    Args:
+        path: the file.
+        names: of the frames that are wanted.
+
+    Returns:
+        ``(n, 3, 3)`` float64 intrinsics in the order of ``names``, and ``(n, 4)`` what each frame shows of
+        its image; None where the file does not say, for images that are all picture.
+
+    Raises:
+        DataError: it cannot be read, a frame has no line, or a line holds no camera.
+    """
+    rows: dict[str, list[float]] = {}
+    for line in read_text(path).splitlines():
+        name, _, numbers = line.rpartition("\t")
+        words = numbers.split()
+        if len(words) not in (4, 8):
+            raise DataError(
+                f"{path} has the line {shown(line)}, no frame with its camera: prepare the scan again"
+            )
+        rows[name] = [_as_number(word, path) for word in words]
+    missing = [name for name in names if name not in rows]
+    if missing or len({len(rows[name]) for name in names}) != 1:
+        state = f"has no line for frame {missing[0]}" if missing else "has lines of different lengths"
+        raise DataError(f"{path} {state}: prepare the scan again")
+    values = np.array([rows[name] for name in names])
+    focal = as_numbers(values[:, :2], (-1, 2), FOCAL_LENGTH, f"a focal length in {path}")
+    rest = as_numbers(values[:, 2:], (len(names), -1), PIXEL, f"a pixel in {path}")
+    matrices = np.stack([camera_matrix(*f, *c)[:3, :3] for f, c in zip(focal, rest[:, :2], strict=True)])
+    if values.shape[1] == 4:
+        return torch.from_numpy(matrices), None
+    if not (rest[:, 4:] > rest[:, 2:4]).all():
+        raise DataError(f"{path} has a frame that shows nothing of its image: prepare the scan again")
+    return torch.from_numpy(matrices), torch.from_numpy(rest[:, 2:].copy())
+
+
+def _as_number(word: str, path: Path) -> float:
+    try:
+        return float(word)
+    except ValueError as error:
+        raise DataError(
+            f"{path} has {shown(word)} where a number is needed: prepare the scan again"
+        ) from error
 
 
 def camera_matrix(fx: float, fy: float, cx: float, cy: float) -> NDArray[np.float64]:

@@ -6,6 +6,8 @@ front is +X and the model lies in a unit cube around the origin: we turn it by +
 as in v2. The two releases were converted from the source files by different programs, so the
 mean vertices of one model can differ a little; its box does not. A few models of v1 are mirrored left to
 right, which the box alone cannot tell: use v2, for which Scan2CAD was annotated, if you have the choice.
+
+Where objects have no CAD model, what of a scan's mesh stands in an object's box takes its place (``BOXED``).
 """
 
 from __future__ import annotations
@@ -33,7 +35,14 @@ _log = logging.getLogger(__name__)
 STEM = "model_normalized"
 """Name without ending of every file of a model."""
 
-Version = Literal["v1", "v2"]
+BOXED = "in_box.obj"
+"""Mesh of one object of a scan, in the object's frame with the object's box as the cube [-½, ½]³. Unlike that
+of a CAD model it need not reach the sides of the box: a scan sees parts of things."""
+
+BOX_MODEL = "box"
+"""Model name of objects of which nothing but the box is known; their mesh is the box."""
+
+Version = Literal["v1", "v2", "boxed"]
 
 V2_FROM_V1 = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 """Rotation from v1's axes (front +X) to v2's (front -Z)."""
@@ -47,6 +56,7 @@ _MESHES: tuple[tuple[str, Version], ...] = (
     (f"models/{STEM}.obj", "v2"),
     ("model.obj", "v1"),
     ("models/model.obj", "v1"),
+    (f"models/{BOXED}", "boxed"),
 )
 _LEAST_DIAGONAL = 1e-12
 """Of a box, in the unit of the file: what is smaller is one point, whose size cannot be made 1."""
@@ -54,7 +64,7 @@ _LEAST_DIAGONAL = 1e-12
 _MAX_FACTS = 2**20
 """Bytes of the largest ``.json`` that is read; ShapeNet's have less than one kilobyte."""
 
-_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.\-]*")
+_NAME = re.compile(r"\w[\w .\-]*")
 _CATEGORY = "[0-9]" * 8
 
 
@@ -122,6 +132,16 @@ def mesh_path(root: Path, catid: str, model_id: str) -> Path:
     return _mesh_of(root, catid, model_id)[0]
 
 
+def is_boxed(root: Path, catid: str, model_id: str) -> bool:
+    """Return whether a model is what stands in an object's own box, see ``BOXED``; see ``mesh_path``."""
+    return _mesh_of(root, catid, model_id)[1] == "boxed"
+
+
+def has_own_shape(model_id: str) -> bool:
+    """Return whether more than the box is known of objects with the model ``catid/id``."""
+    return model_id.rpartition("/")[2] != BOX_MODEL
+
+
 def model_folder(root: Path, catid: str, model_id: str) -> Path:
     """Return the folder of a model's files; see ``mesh_path``."""
     return mesh_path(root, catid, model_id).parent
@@ -186,6 +206,8 @@ def copy_model(root: Path, catid: str, model_id: str, output_root: Path) -> Path
     with finished_folder(folder) as files:
         if version == "v1":
             _convert_v1(path, vertices, model_id, files)
+        elif version == "boxed":
+            shutil.copyfile(path, files / path.name)
         else:
             for ending in ("obj", "mtl", "json", "solid.binvox"):
                 source = path.with_name(f"{STEM}.{ending}")

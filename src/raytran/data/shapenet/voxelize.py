@@ -26,20 +26,31 @@ _MAX_CELLS = 1 << 20
 """Most cells that the boxes of the triangles of one block cover, over all three axes; limits the memory."""
 
 
-def voxelize_solid(vertices: ArrayLike, faces: ArrayLike, size: int = SHAPE_SIZE) -> Cells:
-    """Return the cells of a mesh's own box that lie inside it or on its surface.
+def voxelize_solid(
+    vertices: ArrayLike,
+    faces: ArrayLike,
+    size: int = SHAPE_SIZE,
+    *,
+    box: tuple[float, float] | None = None,
+) -> Cells:
+    """Return the cells of a box that lie inside a mesh or on its surface.
 
     Args:
         vertices: ``(V, 3)``, any unit.
         faces: ``(F, 3)`` vertex indices.
         size: cells along each side (S).
+        box: from where to where the box reaches along each axis; no vertex may lie outside. None: the
+            axis-aligned box of all ``vertices``.
 
     Returns:
-        ``(S, S, S)`` bool indexed [x, y, z]. The cells divide the axis-aligned box of all ``vertices``, each
-        axis by itself: cell ``i`` spans ``low + [i, i + 1] / S * (high - low)``.
+        ``(S, S, S)`` bool indexed [x, y, z]. The cells divide the box, each axis by itself: cell ``i`` spans
+        ``low + [i, i + 1] / S * (high - low)``.
     """
     points = np.asarray(vertices, dtype=np.float64)
-    low, extent = points.min(axis=0), np.ptp(points, axis=0)
+    if box is None:
+        low, extent = points.min(axis=0), np.ptp(points, axis=0)
+    else:
+        low, extent = np.full(3, box[0]), np.full(3, box[1] - box[0])
     # A mesh that is flat along an axis lies in the middle layer of cells.
     unit = np.where(extent > 0, (points - low) / np.where(extent > 0, extent, 1.0), 0.5)
     solid, surface = scan_convert(unit * size, faces, size)
