@@ -17,7 +17,7 @@ from ..forms import OPENGL, SCAN
 
 CHECKS = [
     *("frames", "images", "camera axes", "intrinsics", "unit", "annotation unit", "objects upright", "up"),
-    *("annotation placed", "volume", "handedness", "CAD meshes"),
+    *("annotation placed", "volume", "boxes in view", "handedness", "CAD meshes"),
 ]
 YUP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 

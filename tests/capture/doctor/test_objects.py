@@ -15,16 +15,19 @@ from raytran.capture.doctor.depth import SurfacePoints
 from raytran.capture.doctor.objects import (
     MISPLACED,
     check_boxes,
+    check_in_view,
     check_models,
     check_placement,
     count_hits,
     rotated,
 )
 from raytran.data.scan2cad import read_annotations
-from raytran.data.shapenet.models import mesh_path
+from raytran.data.shapenet.models import BOXED, mesh_path
+from raytran.geometry.camera import Cameras
 from raytran.geometry.rotation import rotation_from_yaw
 from raytran.structs import ObjectSet
 
+from ...scan_forms import look_along_x
 from ..forms import SCAN
 
 
@@ -245,3 +248,34 @@ def test_missing_models_are_counted(copy):
 def test_without_models_meshes_are_unknown(room):
     findings = check_models(annotation(room), None)
     assert [finding.state for finding in findings] == ["ok", "unknown"]
+
+
+def cameras_along_x(positions):
+    poses = torch.from_numpy(np.stack([look_along_x(x) for x in positions]))
+    intrinsics = torch.tensor([[40.0, 0, 24], [0, 40, 16], [0, 0, 1]], dtype=torch.float64)
+    return Cameras(intrinsics.expand(len(poses), 3, 3), poses, (32, 48))
+
+
+def test_boxes_where_no_camera_looks_are_a_fault(furniture):
+    cameras = cameras_along_x([0.0, 0.1])
+    ahead = replace(furniture, center=torch.tensor([[3.0, 0, 1]]).expand(5, 3))
+    assert check_in_view(ahead, cameras).state == "ok"
+    behind = replace(furniture, center=torch.tensor([[-3.0, 0, 1]]).expand(5, 3))
+    finding = check_in_view(behind, cameras)
+    assert (finding.state, finding.cause) == ("fault", "boxes in another world than the poses")
+    assert finding.text == "5 of 5 boxes lie where no camera looks"
+    far = replace(furniture, center=torch.tensor([[300.0, 0, 1]]).expand(5, 3))
+    assert check_in_view(far, cameras).state == "fault"
+    mixed = replace(furniture, center=torch.cat([ahead.center[:4], behind.center[:1]]))
+    assert check_in_view(mixed, cameras).state == "note"
+
+
+def test_the_mesh_in_a_box_may_be_a_part_but_not_leave_it(tmp_path, write_annotations, cube_entry):
+    models = tmp_path / "shapenet" / "chair" / "a" / "models"
+    models.mkdir(parents=True)
+    entry = cube_entry(catid_cad="chair", id_cad="a", center=[0, 0, 0], bbox=[0.5, 0.5, 0.5])
+    annotation = read_annotations(write_annotations({"scene0000_00": [entry]}))["scene0000_00"]
+    for high, state in ((0.2, "ok"), (0.6, "fault")):
+        (models / BOXED).write_text(f"v 0 0 0\nv {high} 0 0\nv 0 {high} 0\nf 1 2 3\n")
+        finding = check_models(annotation, tmp_path / "shapenet")[-1]
+        assert (finding.check, finding.state) == ("CAD meshes", state)

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from raytran.capture.doctor.cameras import NO_READING, CameraCheck, check_cameras
@@ -23,6 +24,7 @@ from raytran.capture.doctor.matches import Matches, match_frames
 from raytran.capture.doctor.objects import (
     MISPLACED,
     check_boxes,
+    check_in_view,
     check_models,
     check_placement,
     count_hits,
@@ -36,10 +38,14 @@ from raytran.data.scannet.find import ScanSource
 from raytran.data.scannet.layout import find_layout
 from raytran.data.scannet.text import are_rigid, read_pose
 from raytran.errors import DataError
+from raytran.geometry.camera import Cameras
 from raytran.structs import ObjectSet
 
 _MAX_IMAGES = 150
 """Images that are decoded to see whether they can be; a scan with more is sampled."""
+
+OBJECTS_OUTSIDE = "objects outside the volume"
+"""Cause where most boxes are beyond the volume around the cameras."""
 
 _MANY_OUTSIDE = 0.25
 """Share of cameras outside the volume that is a fault; a long walk has some."""
@@ -133,7 +139,7 @@ def check_volume(
         return Finding("volume", "fault", text, "cameras outside the volume", fix, "certain")
     if objects > len(centers) / 2:
         fix = "check that annotation and poses share one world; if so, use frames near the objects"
-        return Finding("volume", "fault", text, "objects outside the volume", fix, "certain")
+        return Finding("volume", "fault", text, OBJECTS_OUTSIDE, fix, "certain")
     return Finding("volume", "note" if cameras or objects else "ok", text)
 
 
@@ -169,7 +175,11 @@ def _examine_scan(
     misplaced = any(finding.cause == MISPLACED for finding in result.findings)
     objects = ObjectSet.empty() if misplaced else result.objects
     volume = check_volume(poses[:, :3, 3], objects.center.double().numpy(), extent)
-    return replace(result, findings=(*result.findings, volume))
+    result = replace(result, findings=(*result.findings, volume))
+    if not len(objects) or volume.cause == OBJECTS_OUTSIDE:
+        return result
+    in_view = check_in_view(objects, _corrected_cameras(raw, result.correction))
+    return replace(result, findings=(*result.findings, in_view))
 
 
 def _check_world(result: Examination, raw: RawScan, surface: SurfacePoints) -> Examination:
@@ -203,6 +213,12 @@ def _check_world(result: Examination, raw: RawScan, surface: SurfacePoints) -> E
         correction = replace(correction, world_transform=moved @ correction.world_transform)
         findings.append(placed)
     return replace(result, findings=(*result.findings, *findings), correction=correction, objects=objects)
+
+
+def _corrected_cameras(raw: RawScan, correction: Correction) -> Cameras:
+    intrinsics = raw.intrinsics if correction.intrinsics is None else correction.intrinsics
+    poses = torch.from_numpy(correction.apply(raw.stored))
+    return Cameras(torch.from_numpy(intrinsics), poses, raw.scan.image_size, raw.scan.picture)
 
 
 def _surface_points(raw: RawScan, matches: Matches, cameras: CameraCheck, scale: float) -> SurfacePoints:

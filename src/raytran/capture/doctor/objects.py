@@ -15,8 +15,11 @@ from numpy.typing import NDArray
 from raytran.capture.doctor.depth import SurfacePoints
 from raytran.capture.doctor.finding import Finding
 from raytran.data.scan2cad import SceneAnnotation
-from raytran.data.shapenet.models import STEM, model_folder, read_binvox, read_mesh
+from raytran.data.shapenet.models import STEM, is_boxed, model_folder, read_binvox, read_mesh
 from raytran.errors import DataError
+from raytran.geometry.boxes import OrientedBoxes
+from raytran.geometry.boxes_in_view import boxes_in_view
+from raytran.geometry.camera import Cameras
 from raytran.structs import ObjectSet
 
 MISPLACED = "annotation not where the images show objects"
@@ -246,6 +249,24 @@ def check_placement(
     return np.eye(4), Finding(check, "ok", text)
 
 
+def check_in_view(objects: ObjectSet, cameras: Cameras) -> Finding:
+    """Check that cameras look at the boxes; in another world than theirs, boxes lie anywhere.
+
+    Args:
+        objects: M boxes, at least one.
+        cameras: of the N frames.
+    """
+    boxes = OrientedBoxes(*(t.double() for t in (objects.center, objects.size, objects.rotation)))
+    unseen = int((~boxes_in_view(boxes, cameras)).sum())
+    text = f"{unseen} of {len(objects)} boxes lie where no camera looks"
+    if unseen > len(objects) / 2:
+        fix = "annotate in the world of the poses, in metres, or take the poses that belong to the annotation"
+        return Finding(
+            "boxes in view", "fault", text, "boxes in another world than the poses", fix, "certain"
+        )
+    return Finding("boxes in view", "note" if unseen else "ok", text)
+
+
 @dataclass(frozen=True)
 class _Mismatch:
     """A CAD that is not the one that was annotated.
@@ -334,6 +355,11 @@ def _mismatch(model: str, center: NDArray, half: NDArray, root: Path) -> _Mismat
     """Compare a mesh with the annotation's box (``center``, ``half`` size) and with its own voxels."""
     mesh = read_mesh(root, *model.split("/"))
     used = mesh.vertices[np.unique(mesh.faces)]
+    if is_boxed(root, *model.split("/")):
+        # It shows what a scan has seen of an object, which may be a part of the box, but nothing else.
+        beyond = float((np.abs(used - center) - half).max())
+        is_right = beyond <= _BOX_DIFFERS
+        return None if is_right else _Mismatch(model, f"mesh leaves its box by {beyond:.3f}", "the box")
 
     def box_error(change: NDArray) -> float:
         points = used @ change.T
