@@ -714,7 +714,14 @@ def _transformed(
         poses[:, :3] = rotation @ poses[:, :3]
         # aligned_from_world is from another world now.
         alignment[:3, :3] = alignment[:3, :3] @ rotation.T
-    return replace(scan, world_from_camera=poses, axis_alignment=alignment)
+    moved = scan.world_from_input
+    if world_rotation is not None or scale != 1.0:
+        step = torch.eye(4, dtype=torch.float64)
+        step[:3, :3] *= scale
+        if world_rotation is not None:
+            step[:3, :3] = torch.from_numpy(world_rotation) @ step[:3, :3]
+        moved = step if moved is None else step @ moved
+    return replace(scan, world_from_camera=poses, axis_alignment=alignment, world_from_input=moved)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -804,6 +811,7 @@ def rotate_upright(scan: OpenScan, up: NDArray[np.float64]) -> OpenScan:
         axis_alignment=scan.axis_alignment,
         dropped=scan.dropped,
         damage=scan.damage,
+        world_from_input=scan.world_from_input,
         stored=scan,
         quarters=tuple(quarters.tolist()),
     )

@@ -71,6 +71,8 @@ class OpenScan(ABC):
         axis_alignment: ``(4, 4)`` float64, aligned_from_world; identity if the scan has none.
         dropped: reason for each frame that was left out, by frame name.
         damage: a sentence about a file that ends early, or None.
+        world_from_input: ``(4, 4)`` float64, from the world and unit of the poses as they were read to those
+            of ``world_from_camera``; None: they are the same.
     """
 
     scene_id: str
@@ -82,6 +84,7 @@ class OpenScan(ABC):
     dropped: dict[str, str]
     picture: Tensor | None = None
     damage: str | None = None
+    world_from_input: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.frame_id)

@@ -34,7 +34,7 @@ MARKER = "prepare.json"
 """File with the settings that a prepared folder was begun with."""
 
 _LOCK = ".prepare.lock"
-_UNFINISHED = (
+UNFINISHED_FILES = (
     f"{UNFINISHED}*",
     f"scannet/{UNFINISHED}*",
     f"scannet/scans/{UNFINISHED}*",
@@ -96,10 +96,10 @@ def prepare_scan2cad(
     preparation = Preparation(output, settings, sources, work)
     try:
         with claimed(output, settings, {"annotations": None if path is None else file_digest(path)}):
-            sweep(output, *_UNFINISHED)
+            sweep(output, *UNFINISHED_FILES)
             preparation.log_estimate(processes)
             report = preparation.run(grid_extent)
-            sweep(output, *_UNFINISHED)
+            sweep(output, *UNFINISHED_FILES)
     except OSError as error:
         check_disk(error, output)
         raise

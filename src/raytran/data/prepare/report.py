@@ -98,8 +98,8 @@ def make_report(
     return {
         "scans": {"prepared": len(facts)} | {split: len(names) for split, names in membership.items()},
         "objects": _objects_by_class(objects, membership or {"all": list(facts)}),
-        "frames": _frames(facts),
-        "size": _sizes(output, facts),
+        "frames": frame_counts(facts),
+        "size": sizes(output, facts),
         "left_out": {
             "scans_failed": dict(sorted(outcome.failed.items())),
             "scans_without_annotation": selection.without_annotation,
@@ -131,7 +131,8 @@ def _objects_by_class(
     return table
 
 
-def _frames(facts: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+def frame_counts(facts: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return how many frames scans had, were written and left out, by the facts of each scan."""
     reasons = Counter(reason for f in facts.values() for reason in f["dropped"].values())
     return {
         "in_scans": sum(f["frames"] for f in facts.values()),
@@ -145,7 +146,7 @@ def _frames(facts: Mapping[str, dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _sizes(output: Path, facts: Mapping[str, dict[str, Any]]) -> dict[str, int]:
+def sizes(output: Path, facts: Mapping[str, dict[str, Any]]) -> dict[str, int]:
     """Return bytes of files; the many frames are not counted again, their scans' facts have the sum."""
     return {
         "color_bytes": sum(f["bytes"] for f in facts.values()),
@@ -194,9 +195,9 @@ def _facts_with(key: str, facts: Mapping[str, dict[str, Any]]) -> dict[str, Any]
 
 def report_text(report: Mapping[str, Any]) -> str:
     """Return the report as text; of many names the first few, the others are in ``report.json``."""
-    left_out = [line for key, what in _LEFT_OUT.items() for line in _named(what, report["left_out"][key])]
+    left_out = [line for key, what in _LEFT_OUT.items() for line in named(what, report["left_out"][key])]
     left_out += _objects_left_out(report["left_out"]["objects"])
-    noticed = [line for key, what in _NOTICED.items() for line in _named(what, report["noticed"][key])]
+    noticed = [line for key, what in _NOTICED.items() for line in named(what, report["noticed"][key])]
     lines = [*_counts(report), "", *class_table(report["objects"]), ""]
     lines += ["Left out", *(left_out or ["  nothing"]), "Noticed", *(noticed or ["  nothing"])]
     return "\n".join(lines) + "\n"
@@ -222,6 +223,15 @@ def _counts(report: Mapping[str, Any]) -> Iterable[str]:
         f"{split} {count}{_paper(split)}" for split, count in scans.items() if split != "prepared"
     )
     yield f"Scans    {scans['prepared']} prepared" + (f": {splits}" if splits else ", no split files")
+    yield from frame_lines(frames)
+    yield (
+        f"Size     frames {gigabytes(size['color_bytes'])}, CAD models {gigabytes(size['model_bytes'])}, "
+        f"targets {gigabytes(size['target_bytes'])}"
+    )
+
+
+def frame_lines(frames: Mapping[str, Any]) -> Iterable[str]:
+    """Return what is said of the frames: where from, how large, how many, and why not the others."""
     for what in ("forms", "stored_sizes"):
         counts = ", ".join(f"{name} {count}" for name, count in frames[what].items())
         yield f"         {what.replace('_', ' ')}: {counts}"
@@ -235,10 +245,6 @@ def _counts(report: Mapping[str, Any]) -> Iterable[str]:
         yield f"         {others} not taken because of max_frames"
     if frames["damaged_images"]:
         yield f"         {frames['damaged_images']} dropped: damaged image"
-    yield (
-        f"Size     frames {gigabytes(size['color_bytes'])}, CAD models {gigabytes(size['model_bytes'])}, "
-        f"targets {gigabytes(size['target_bytes'])}"
-    )
 
 
 def _paper(split: str) -> str:
@@ -250,10 +256,10 @@ def _objects_left_out(objects: Iterable[Mapping[str, str]]) -> list[str]:
     for item in objects:
         name = f"{item['scan']}: {item['model']}" if item["model"] else item["scan"]
         by_reason.setdefault(item["reason"], []).append(name)
-    return [line for reason, names in by_reason.items() for line in _named(f"objects, {reason}", names)]
+    return [line for reason, names in by_reason.items() for line in named(f"objects, {reason}", names)]
 
 
-def _named(what: str, names: Sequence[str] | Mapping[str, Any]) -> list[str]:
+def named(what: str, names: Sequence[str] | Mapping[str, Any]) -> list[str]:
     """Return a line with the count and lines with the first names, each with its reason if there is one."""
     if not names:
         return []

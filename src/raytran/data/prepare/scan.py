@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -20,6 +20,7 @@ from raytran.data.prepare.annotation import Entry
 from raytran.data.prepare.targets import check_disk, write_masks
 from raytran.data.scan import OpenScan
 from raytran.data.scannet.find import ScanSource
+from raytran.data.scannet.layout import FRAME_CAMERAS
 from raytran.data.scannet.scan import read_scan
 from raytran.data.text import read_json_object
 from raytran.data.views import choose_even
@@ -115,40 +116,69 @@ def read_facts(output: Path, scene_id: str) -> dict[str, Any]:
 
 def _write_scan(source: ScanSource, folder: Path, settings: PrepareSettings, *, tried: list[str]) -> None:
     with source.open() as scan:
-        used, damaged = write_frames(
-            scan, folder, image_size=settings.image_size, max_frames=settings.max_frames
+        write_scan(scan, folder, settings, form=source.form, facts={"failed_sources": tried})
+
+
+def write_scan(
+    scan: OpenScan, folder: Path, settings: PrepareSettings, *, form: str, facts: Mapping[str, object]
+) -> None:
+    """Write an open scan's frames, cameras and facts into an empty folder.
+
+    Args:
+        scan: of any source.
+        folder: of the prepared scan.
+        settings: of the preparation.
+        form: what the scan was recognised as.
+        facts: more to say in ``FACTS``.
+
+    Raises:
+        DataError: fewer than two frames can be used.
+    """
+    used, damaged = write_frames(scan, folder, image_size=settings.image_size, max_frames=settings.max_frames)
+    total = len(scan.frame_id) + len(scan.dropped)
+    if len(used) < MIN_VIEWS:
+        first = next(iter(damaged.values()), next(iter(scan.dropped.values()), "it has no more"))
+        raise DataError(
+            f"only {len(used)} of the {total} frames of {scan.path} can be used ({first}): "
+            "copy or export the scan again"
         )
-        total = len(scan.frame_id) + len(scan.dropped)
-        if len(used) < MIN_VIEWS:
-            first = next(iter(damaged.values()), next(iter(scan.dropped.values()), "it has no more"))
-            raise DataError(
-                f"only {len(used)} of the {total} frames of {source.path} can be used ({first}): "
-                "copy or export the scan again"
-            )
-        pose = scan.world_from_camera[used]
-        cameras = scan.cameras[used].scaled_to(settings.image_size)
-        _write_camera_facts(folder, cameras, scan.axis_alignment)
-        write_json(
-            folder / FACTS,
-            {
-                "form": source.form,
-                "frames": total,
-                "written": len(used),
-                "dropped": scan.dropped,
-                "cut": scan.damage,
-                "damaged": damaged,
-                "failed_sources": tried,
-                "stored_size": list(scan.image_size),
-                "camera_center": pose[:, :3, 3].mean(dim=0).tolist(),
-                "bytes": sum(file.stat().st_size for file in (folder / "color").iterdir()),
-            },
-        )
+    pose = scan.world_from_camera[used]
+    cameras = scan.cameras[used].scaled_to(settings.image_size)
+    _write_camera_facts(folder, cameras, scan.axis_alignment)
+    _write_frame_cameras(folder, cameras, [frame_names(scan.frame_id)[position] for position in used])
+    write_json(
+        folder / FACTS,
+        {
+            "form": form,
+            "frames": total,
+            "written": len(used),
+            "dropped": scan.dropped,
+            "cut": scan.damage,
+            "damaged": damaged,
+            **facts,
+            "stored_size": list(scan.image_size),
+            "camera_center": pose[:, :3, 3].mean(dim=0).tolist(),
+            "bytes": sum(file.stat().st_size for file in (folder / "color").iterdir()),
+        },
+    )
+
+
+def _write_frame_cameras(folder: Path, cameras: Cameras, names: Sequence[str]) -> None:
+    """Write the camera of each frame, see ``read_frame_cameras``, unless one does for all."""
+    columns = torch.stack([cameras.intrinsics[:, i, j] for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))], dim=1)
+    if cameras.picture is not None:
+        columns = torch.cat([columns, cameras.picture], dim=1)
+    elif bool((columns == columns[0]).all()):
+        return
+    rows = zip(names, columns.double().tolist(), strict=True)
+    text = "".join(f"{name}\t{' '.join(map(repr, values))}\n" for name, values in rows)
+    (folder / FRAME_CAMERAS).write_text(text, encoding="utf-8")
 
 
 def _write_camera_facts(folder: Path, cameras: Cameras, axis_alignment: torch.Tensor) -> None:
     """Write the intrinsics and ``<scan>.txt``, which say what the frames are now."""
     (folder / "intrinsic").mkdir()
-    matrix = homogeneous(cameras.intrinsics[0])
+    matrix = homogeneous(_middle_intrinsics(cameras))
     (folder / "intrinsic" / "intrinsic_color.txt").write_text(matrix_text(matrix), encoding="ascii")
     height, width = cameras.image_size
     facts: dict[str, object] = {
@@ -163,6 +193,15 @@ def _write_camera_facts(folder: Path, cameras: Cameras, axis_alignment: torch.Te
     }
     lines = "".join(f"{key} = {value}\n" for key, value in facts.items())
     (folder / f"{folder.name}.txt").write_text(lines, encoding="ascii")
+
+
+def _middle_intrinsics(cameras: Cameras) -> Tensor:
+    """Return intrinsics that can stand for all: those of the image that is all picture, if there is one."""
+    if cameras.picture is None:
+        return cameras.intrinsics[0]
+    height, width = cameras.image_size
+    is_whole = (cameras.picture == cameras.picture.new_tensor([0, 0, width, height])).all(dim=1)
+    return cameras.intrinsics[int(is_whole.int().argmax())]
 
 
 def write_frames(
@@ -214,7 +253,12 @@ def choose_frames(count: int, max_frames: int | None) -> list[int]:
 
 
 def frame_names(frame_ids: Sequence[str]) -> list[str]:
-    """Return the number in each frame's name, ``000010`` becomes ``10``; the names if two have the same."""
+    """Return the number in each frame's name, ``000010`` becomes ``10``; the names if two have the same.
+
+    Names with a time, as ``41254925_3211.498``, stay: what is behind the point does not tell their order.
+    """
+    if any(re.search(r"\d\.\d", name) for name in frame_ids):
+        return list(frame_ids)
     short = []
     for name in frame_ids:
         numbers = re.findall(r"\d+", name)
