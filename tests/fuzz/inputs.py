@@ -23,6 +23,9 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from raytran.backbone.encoder_weights import read_state
+from raytran.capture.boxes.arkitscenes import ArkitScan
+from raytran.capture.boxes.box_list import boxed_objects, read_box_list
+from raytran.capture.boxes.categories import Categories
 from raytran.capture.open import open_scene
 from raytran.capture.orientation import WorldSettings
 from raytran.capture.render_cameras import read_render_cameras
@@ -30,18 +33,23 @@ from raytran.checkpoints.file import PREFIX, write_checkpoint, write_weights
 from raytran.checkpoints.load import load_model, prediction_settings
 from raytran.checkpoints.metadata import checkpoint_metadata
 from raytran.checkpoints.runs import read_finished
-from raytran.classes import Classes
+from raytran.classes import PAPER_CLASSES, Classes
 from raytran.data.cache import MaskCache
 from raytran.data.files import SettingsRecord
 from raytran.data.prepare.annotation import read_usable
+from raytran.data.prepare.boxed_mesh import box_mesh
+from raytran.data.prepare.boxed_objects import BoxedObjects
+from raytran.data.prepare.boxed_scan import obj_text
 from raytran.data.prepare.scan import read_facts as read_prepared_facts
 from raytran.data.scan2cad import read_annotations, scene_alignments, scene_objects
 from raytran.data.scannet.find import read_splits
+from raytran.data.scannet.scan import read_scan
 from raytran.data.scannet.sens import SensFile
+from raytran.data.scannet.text import read_frame_cameras
 from raytran.data.scene_list import read_split
 from raytran.data.shapenet.meshes import read_binvox, read_face_colors, read_obj, write_binvox
-from raytran.data.shapenet.models import read_facts, read_mesh
-from raytran.data.targets import _scan_surface
+from raytran.data.shapenet.models import BOXED, read_facts, read_mesh
+from raytran.data.targets import scan_surface, shape_grids
 from raytran.export import read_scene_json, write_prediction
 from raytran.export.read import BOXER_COLUMNS, read_alignments_csv, read_predictions, read_roca_csv
 from raytran.rooms.library import read_library
@@ -412,7 +420,7 @@ def read_model_v1(folder: Path) -> None:
 
 
 def read_scan_mesh(name: str, folder: Path) -> None:
-    vertices, faces = _scan_surface(folder / name, "")
+    vertices, faces = scan_surface(folder / name, "")
     within(vertices, -1e9, 1e9, "vertices")
     within(faces, 0, len(vertices) - 1, "faces")
 
@@ -456,6 +464,7 @@ def data(root: Path) -> list[Input]:
         "facts",
         "records",
         "cache",
+        "frame-cameras",
     )
     folders = {name: root / name for name in names}
     for name in set(names) - {"model-v2", "model-v1"}:
@@ -496,6 +505,16 @@ def data(root: Path) -> list[Input]:
     def read_cache(folder: Path) -> None:
         MaskCache(folder=folder).read("masks", "abcdef", (4, 8))
 
+    def read_frame_lenses(folder: Path) -> None:
+        matrices, picture = read_frame_cameras(folder / "frames.txt", ["0", "a 1"])
+        within(matrices[:, [0, 1], [0, 1]], 1e-2, 1e7, "focal lengths")
+        within(matrices[:, :2, 2], -1e6, 1e6, "principal points")
+        if picture is not None:
+            within(picture[:, 2:] - picture[:, :2], 0, 2e6, "sides of pictures")
+
+    (folders["frame-cameras"] / "frames.txt").write_text(
+        "0\t40.5 41 24 16 0 0 48 32\na 1\t40 41 24 16 8 0 40 32\n"
+    )
     meshes = [
         Input(f"scan-mesh-{name}", folders["scan-mesh"], partial(read_scan_mesh, name), (name,))
         for name in ("mesh.ply", "ascii.ply", "mesh.obj")
@@ -511,6 +530,7 @@ def data(root: Path) -> list[Input]:
         Input("facts", folders["facts"], lambda folder: read_prepared_facts(folder, "scene0000_00") and None),
         Input("records", folders["records"], read_record_file),
         Input("cache", folders["cache"], read_cache),
+        Input("frame-cameras", folders["frame-cameras"], read_frame_lenses),
     ]
 
 
@@ -729,6 +749,71 @@ def results(root: Path) -> list[Input]:
     ]
 
 
+# ---------------------------------------------------------------- boxes
+
+
+CATEGORIES = Categories(PAPER_CLASSES, unknown_left_out=True)
+
+
+def check_boxed(objects: BoxedObjects) -> None:
+    """Raise unless objects that were annotated by boxes can be."""
+    within(objects.center, -1e6, 1e6, "centres")
+    within(objects.size, 1e-6, 1e6, "sizes")
+    turns = objects.rotation
+    within(turns.swapaxes(1, 2) @ turns - np.eye(3), -0.05, 0.05, "RᵀR - 1")
+    within(np.linalg.det(turns), 0.9, 1.1, "determinants")
+    for mesh in (*objects.mesh, objects.scan_mesh):
+        if mesh is not None:
+            within(mesh[0], -1e9, 1e9, "vertices")
+    if not len(objects):
+        raise NonsenseError("an annotation without objects")
+
+
+def read_listed(folder: Path) -> None:
+    listed = read_box_list(folder / "boxes.json")
+    check_boxed(boxed_objects(listed, CATEGORIES, world_from_input=None, scan_mesh=None))
+
+
+def read_arkit_boxes(folder: Path) -> None:
+    scan = ArkitScan(folder / "1", None, CATEGORIES)
+    with read_scan(folder / "scan") as frames:
+        check_boxed(scan.read_objects(frames))
+
+
+def read_boxed_mesh(folder: Path) -> None:
+    grid = shape_grids(("chair/a.000",), shapenet_root=folder, cache=MaskCache(folder=folder / "cache"))
+    within(grid.double(), 0, 1, "cells")
+
+
+def boxes(root: Path) -> list[Input]:
+    """Return annotations by boxes, and the mesh in one."""
+    for name in ("boxes", "arkit-boxes/1", "boxed/chair/a.000/models"):
+        (root / name).mkdir(parents=True)
+    box = trimesh.creation.box((0.5, 0.5, 0.9))
+    box.export(root / "boxes" / "chair.ply")
+    entry = {"category": "chair", "center": [1.0, 0, 0.4], "size": [0.5, 0.9, 0.5], "yaw": 0.5}
+    turn = {"yaw": None, "rotation": [[1, 0, 0], [0, 0, -1], [0, 1, 0]], "symmetry": 2}
+    others = [entry | {"mesh": "chair.ply"}, entry | turn]
+    content = {"format": "raytran.scene/1", "split": "val", "objects": [entry, *others]}
+    content |= {"capture": {"scale": 1.0}, "unit": "m"}
+    (root / "boxes" / "boxes.json").write_text(json.dumps(content))
+    axes = [0.8, 0.6, 0, -0.6, 0.8, 0, 0, 0, 1]
+    segments = {
+        "obbAligned": {"centroid": [1, 2, 0.4], "axesLengths": [0.5, 0.6, 0.9], "normalizedAxes": axes}
+    }
+    data = [{"label": label, "segments": segments} for label in ("chair", "lamp", "table")]
+    folder = root / "arkit-boxes"
+    (folder / "1" / "1_3dod_annotation.json").write_text(json.dumps({"data": data, "skipped": False}))
+    box.export(folder / "1" / "1_3dod_mesh.ply")
+    make_scannet(folder / "scan")
+    (root / "boxed" / "chair" / "a.000" / "models" / BOXED).write_text(obj_text(box_mesh()))
+    return [
+        Input("boxes", root / "boxes", read_listed),
+        Input("arkit-boxes", folder, read_arkit_boxes, ("1/*",)),
+        Input("boxed-mesh", root / "boxed", read_boxed_mesh),
+    ]
+
+
 # ---------------------------------------------------------------- checkpoints
 
 
@@ -818,4 +903,4 @@ def all_inputs(root: Path) -> list[Input]:
     """Write a valid input of every kind below a folder, and return them; each is read once as it is."""
     root.mkdir(parents=True)
     torch.manual_seed(0)
-    return [*scans(root), *data(root), *results(root), *checkpoints(root)]
+    return [*scans(root), *data(root), *results(root), *boxes(root), *checkpoints(root)]

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from raytran.errors import ConfigError
+from raytran.capture.boxes.arkitscenes import FoundScans
+from raytran.data.prepare import Prepared
+from raytran.errors import ConfigError, DataError
 from raytran.run.entry import compose
 from raytran.run.prepare import prepare as module
 from raytran.run.prepare.prepare import prepare
@@ -82,10 +84,16 @@ def test_commands_of_the_documentation_compose(project_root):
         (("dataset=rooms-v1-furniture", "output=x", "cads=y", "min_objects=1"), "leave out min_objects="),
         (
             ("dataset=scannet", "output=x"),
-            "choose one of rooms, rooms-v1, rooms-v1-furniture, scan2cad, cads",
+            "choose one of rooms, rooms-v1, rooms-v1-furniture, scan2cad, boxes, arkitscenes, cads",
         ),
         (("dataset=scan2cad", "output=x"), "scannet= is missing"),
         (("dataset=cads", "output=x"), "source= is missing"),
+        (("dataset=boxes", "output=x"), "captures= is missing"),
+        (("dataset=arkitscenes", "output=x"), "arkitscenes= is missing"),
+        (
+            ("dataset=boxes", "output=x", "captures=y", "categories={couch: settee}"),
+            "couch=settee names no class",
+        ),
         (("dataset=scan2cad", "scannet=a", "scan2cad=b", "output=x"), "give shapenet="),
         (("dataset=scan2cad", "scannet=a", "max_frames=1", "output=x"), "max_frames ≥ 2"),
     ],
@@ -109,6 +117,51 @@ def test_scans_without_annotation_from_the_command_line(tmp_path, caplog):
     assert "found: scans 1 (exporter 1); no CAD models" in said[0]
     assert "scans 1, frames about 2; expect" in said[1]
     assert said[-1] == f"python -m raytran.train data=scan2cad data.root={tmp_path / 'out'}"
+
+
+def test_captures_with_classes_of_ones_own_from_the_command_line(tmp_path, caplog):
+    write_scan(tmp_path / "captures" / "hall")
+    entry = {"category": "chair", "center": [0, 0, 2], "size": [1, 1, 1], "mesh": None}
+    lists = tmp_path / "lists" / "hall"
+    lists.mkdir(parents=True)
+    (lists / "scene.json").write_text(json.dumps([entry, entry | {"category": "Old Drill"}]))
+    typed = [f"captures={tmp_path / 'captures'}", f"boxes={tmp_path / 'lists'}", f"output={tmp_path / 'out'}"]
+    typed += ["classes.names=[drill,chair]", "categories={old drill: drill}", "processes=1"]
+    with caplog.at_level(logging.INFO):
+        prepared = prepare(config("dataset=boxes", *typed))
+    assert prepared.report["objects"]["train"] == {"chair": 1, "drill": 1}
+    said = [record.getMessage() for record in caplog.records]
+    assert any("to do: scans 1, frames about 4; expect" in text for text in said)
+    assert said[-1] == (
+        f"python -m raytran.train data=boxes data.root={tmp_path / 'out'} 'classes.names=[drill,chair]'"
+    )
+    unknown = [*typed[:4], "processes=1"]
+    with pytest.raises(
+        DataError, match=r"is of category 'Old Drill', which is no class: choose one of drill"
+    ):
+        prepare(config("dataset=boxes", *unknown[:2], f"output={tmp_path / 'other'}", *unknown[3:]))
+
+
+def test_arkitscenes_and_its_classes_from_the_command_line(monkeypatch, caplog, tmp_path):
+    calls = []
+
+    def find(root, categories, **options):
+        calls.append((root, categories, options))
+        return FoundScans((), (), ("1",))
+
+    monkeypatch.setattr(module, "find_arkitscenes", find)
+    report = Prepared(tmp_path, {}, "report")
+    monkeypatch.setattr(module, "prepare_boxes", lambda *args, **options: calls.append(options) or report)
+    with caplog.at_level(logging.INFO):
+        prepare(
+            config("dataset=arkitscenes", "classes=arkitscenes", "arkitscenes=a", "output=x", "splits=[val]")
+        )
+    (root, categories, options), passed_on = calls
+    assert (root, options) == (Path("a"), {"scenes": None, "splits": ["val"]})
+    assert categories.unknown_left_out
+    assert len(categories.classes) == 17
+    assert passed_on["left_out"] == {"scans_without_boxes": [], "boxes_without_scan": ["1"]}
+    assert caplog.messages[-1] == "python -m raytran.train data=arkitscenes data.root=x classes=arkitscenes"
 
 
 def write_scan(folder):

@@ -36,6 +36,7 @@ def parent(name, **scores):
         ("stage1", parent("stage2")),  # the first stage asks for nothing
         ("stage2", parent("stage1", occupancy__iou=0.2)),
         ("stage2", parent("stage2")),  # more of the same
+        ("stage2", parent("stage3")),  # a finished network is trained on, as the package's own
         ("stage3", Parent("p.ckpt", "stage2", 9, {"val/objects/f1_0.25": 0.01})),
         ("novel_view", parent("stage1")),
         ("novel_view", parent("stage2")),
@@ -59,11 +60,10 @@ def test_a_parent_that_knows_its_task_will_do(experiment, found):
         ("stage2", parent("stage1", occupancy__iou=float("nan")), "is nan and must exceed"),
         ("stage2", parent("stage1"), "has never been validated, so that its occupancy/iou is unknown"),
         (
-            "stage2",
-            parent("stage3"),
-            "is of stage3, but stage2 builds on stage1: train experiment=stage1",
+            "stage3",
+            parent("stage1", occupancy__iou=0.9),
+            "is of stage1, but stage3 builds on stage2: train experiment=stage2 first",
         ),
-        ("stage3", parent("stage1", occupancy__iou=0.9), "builds on stage2: train experiment=stage2 first"),
         ("stage3", Parent("p.ckpt", "stage2", 9, {"val/objects/f1_0.25": 0.0}), "has not learned objects"),
         ("stage2", parent("novel_view"), "is of novel_view, but stage2 builds on stage1"),
     ],
@@ -79,7 +79,7 @@ def test_others_are_refused_unless_forced(experiment, found, message, caplog):
 def test_the_stage_is_asked_for_without_the_scores():
     check_parent(parent("stage1"), stage("stage2"), "stage")
     with pytest.raises(CheckpointError, match="builds on stage1"):
-        check_parent(parent("stage3"), stage("stage2"), "stage")
+        check_parent(parent("novel_view"), stage("stage2"), "stage")
 
 
 def test_the_minimum_is_a_setting():

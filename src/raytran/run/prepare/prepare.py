@@ -5,23 +5,31 @@ from __future__ import annotations
 
 import logging
 import shlex
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
+from raytran.capture.boxes.arkitscenes import find_arkitscenes
+from raytran.capture.boxes.captures import find_captures
+from raytran.capture.boxes.categories import Categories
+from raytran.classes import PAPER_CLASSES, Classes
 from raytran.data.prepare import PrepareSettings, Released, prepare_scan2cad
+from raytran.data.prepare.boxed_scan import AnnotatedSource
+from raytran.data.prepare.prepare_boxes import prepare_boxes
 from raytran.errors import ConfigError
 from raytran.rooms.benchmark import generate_rooms_v1, generate_rooms_v1_furniture
 from raytran.rooms.generate import generate_rooms
 from raytran.rooms.report import report_on_rooms
 from raytran.rooms.sweethome3d.furniture import import_furniture
+from raytran.run.config_dir import config_dir
 from raytran.run.prepare.check import check
 from raytran.run.train.build import plain
 
 _log = logging.getLogger(__name__)
 
-DATASETS = ("rooms", "rooms-v1", "rooms-v1-furniture", "scan2cad", "cads")
+DATASETS = ("rooms", "rooms-v1", "rooms-v1-furniture", "scan2cad", "boxes", "arkitscenes", "cads")
 
 _COUNTS = ("num_train", "num_val", "num_test")
 _FREE_ONLY = ("seed", "frames", "image_size", "min_objects", "max_objects", "room_size")
@@ -55,6 +63,10 @@ def prepare(cfg: DictConfig) -> Any:
         return _prepare_rooms_v1_furniture(settings, output)
     if cfg.dataset == "scan2cad":
         return _prepare_scan2cad(settings, output)
+    if cfg.dataset == "boxes":
+        return _prepare_captures(settings, output)
+    if cfg.dataset == "arkitscenes":
+        return _prepare_arkitscenes(settings, output)
     return _prepare_cads(settings, output)
 
 
@@ -120,6 +132,69 @@ def _prepare_scan2cad(settings: dict[str, Any], output: Path) -> Any:
     _log.info("\n%s\nthe scans are in %s; train on them with", prepared.text, prepared.root)
     _log.info("python -m raytran.train data=scan2cad %s", _data_root(output))
     return prepared
+
+
+def _prepare_captures(settings: dict[str, Any], output: Path) -> Any:
+    if settings["captures"] is None:
+        raise ConfigError("captures= is missing: give the folder with a folder or video for each capture")
+    found = find_captures(Path(settings["captures"]), _categories(settings), boxes=_path(settings["boxes"]))
+    seed = settings["seed"] if settings["seed"] is not None else 0
+    return _prepare_boxes(
+        settings, output, found.captures, found.left_out, val_share=settings["val_share"], seed=seed
+    )
+
+
+def _prepare_arkitscenes(settings: dict[str, Any], output: Path) -> Any:
+    if settings["arkitscenes"] is None:
+        raise ConfigError("arkitscenes= is missing: give the folder with 3dod/Training and 3dod/Validation")
+    found = find_arkitscenes(
+        Path(settings["arkitscenes"]),
+        # Labels that no class has, of which there are some, are left out as in the data set's own scripts.
+        _categories(settings, unknown_left_out=True),
+        scenes=settings["scenes"],
+        splits=settings["splits"],
+    )
+    return _prepare_boxes(settings, output, found.scans, found.left_out)
+
+
+def _prepare_boxes(
+    settings: dict[str, Any],
+    output: Path,
+    sources: Sequence[AnnotatedSource],
+    left_out: Mapping[str, Any],
+    **splits: Any,
+) -> Any:
+    """Prepare scans with boxes, and say how to train on them."""
+    height, width = _with_preset(settings)["image_size"]
+    prepared = prepare_boxes(
+        output,
+        sources,
+        PrepareSettings((height, width), settings["max_frames"], settings["masks"]),
+        left_out=left_out,
+        processes=settings["processes"],
+        **splits,
+    )
+    _log.info("\n%s\nthe scans are in %s; train on them with", prepared.text, prepared.root)
+    data = settings["dataset"]  # each has the configuration of its name
+    _log.info("python -m raytran.train data=%s %s%s", data, _data_root(output), _classes_as_typed(settings))
+    return prepared
+
+
+def _categories(settings: dict[str, Any], *, unknown_left_out: bool = False) -> Categories:
+    return Categories(
+        Classes.of(settings["classes"]), settings["categories"] or {}, unknown_left_out=unknown_left_out
+    )
+
+
+def _classes_as_typed(settings: dict[str, Any]) -> str:
+    """Return the setting that names these classes to another command; nothing for the paper's."""
+    names = Classes.of(settings["classes"]).names
+    if names == PAPER_CLASSES.names:
+        return ""
+    for path in sorted((config_dir() / "classes").glob("*.yaml")):
+        if Classes.of(plain(OmegaConf.load(path))).names == names:
+            return f" classes={path.stem}"
+    return " " + shlex.quote(f"classes.names=[{','.join(names)}]")
 
 
 def _prepare_cads(settings: dict[str, Any], output: Path) -> Any:
