@@ -83,6 +83,7 @@ class BoxedObjects:
             size=self.size * scale,
             rotation=matrix[:3, :3] / scale @ self.rotation,
             mesh=tuple(None if mesh is None else moved_mesh(mesh, matrix) for mesh in self.mesh),
+            scan_mesh=None if self.scan_mesh is None else moved_mesh(self.scan_mesh, matrix),
         )
 
     @property
