@@ -247,11 +247,10 @@ class ObjectSet(TensorStruct):
         Raises:
             DataError: they stand for others.
         """
-        difference = classes.difference(self.classes) if len(self) else None
-        if difference is not None:
+        if len(self) and self.classes.names != classes.names:
             raise DataError(
-                f"objects are of {difference}, and {whose} has {len(classes)} ({classes}): "
-                "give both the same classes"
+                f"objects are of {classes.difference(self.classes)}, and {whose} has {len(classes)} "
+                f"({classes}): give both the same classes"
             )
 
     def select(self, index: Tensor) -> ObjectSet:

@@ -124,6 +124,7 @@ SIGNS = (
 )
 NO_PATHS = {
     "trust": "names of packages",
+    "protocol": "a name",
     "scenes": "names of scans",
     "splits": "names",
     "num_views": "a number",
@@ -358,14 +359,19 @@ def test_no_path_setting_of_conf_is_missing(project_root):
 @pytest.mark.parametrize("command", PATH_SETTINGS)
 def test_path_settings_are_settings(command):
     chosen = {
-        "train": ["preset=tiny", "logger=many", "debug=profiler"],
-        "curriculum": ["preset=tiny", "logger=many", "debug=profiler"],
+        "train": ["preset=tiny", "debug=profiler"],
+        "curriculum": ["preset=tiny", "debug=profiler"],
         "evaluate": ["preset=tiny"],
         "plan": ["preset=tiny"],
     }.get(command, [])
-    settings = [
-        f"++{name}=x" if name == "trainer.default_root_dir" else f"{name}=x"
-        for name in PATH_SETTINGS[command]
-    ]
-    settings = [item for item in settings if not (command == "plan" and item.startswith("data."))]
-    compose(command, [*chosen, *settings])
+    names = [name for name in PATH_SETTINGS[command] if not (command == "plan" and name.startswith("data."))]
+    for logger in ("many", "mlflow") if command in ("train", "curriculum") else (None,):
+        others = (
+            () if logger is None else ("logger.mlflow.",) if logger == "many" else ("logger.t", "logger.w")
+        )
+        settings = [
+            f"++{name}=x" if name == "trainer.default_root_dir" else f"{name}=x"
+            for name in names
+            if not name.startswith(others)
+        ]
+        compose(command, [*chosen, *([f"logger={logger}"] if logger else []), *settings])

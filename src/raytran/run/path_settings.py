@@ -24,8 +24,13 @@ from raytran.run.config_dir import config_dir
 _OF_DATA = ("data.root", "data.dataset.cache_dir", "data.make.cads")
 _OF_TRAINING = (
     *("init_from", "resume", "outputs", "output_dir", "model.backbone.encoder.weights", *_OF_DATA),
-    *("logger.tensorboard.save_dir", "logger.wandb.save_dir", "trainer.default_root_dir"),
-    "trainer.profiler.dirpath",
+    *(
+        "logger.tensorboard.save_dir",
+        "logger.wandb.save_dir",
+        "logger.mlflow.save_dir",
+        "logger.mlflow.store",
+    ),
+    *("trainer.default_root_dir", "trainer.profiler.dirpath"),
 )
 PATH_SETTINGS = {
     "train": _OF_TRAINING,
@@ -35,7 +40,10 @@ PATH_SETTINGS = {
         *_OF_DATA,
     ),
     "predict": ("checkpoint", "scene", "output", "cads", "views", "truth"),
-    "prepare": ("check", "output", "cads", "scannet", "shapenet", "scan2cad", "source"),
+    "prepare": (
+        *("check", "output", "cads", "scannet", "shapenet", "scan2cad", "source"),
+        *("captures", "boxes", "arkitscenes"),
+    ),
     "export_model": ("checkpoint", "output"),
     "plan": ("scene", "model.backbone.encoder.weights"),
     "view": ("folder",),

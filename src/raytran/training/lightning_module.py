@@ -20,7 +20,6 @@ from raytran.structs import RawScene, SceneBatch
 from raytran.training.cast_weights import weights_cast_together
 from raytran.training.health_signals import gradient_norms
 from raytran.training.loggers import is_logged_step
-from raytran.training.norm_counters import batches_counted_together
 from raytran.training.optim import Optimization
 from raytran.training.ranks import mean_over_ranks
 from raytran.training.scores import SceneScores
@@ -93,8 +92,7 @@ class Reconstruction(pl.LightningModule):
         with self._weights_for_a_step():
             # A step waits for its device once: where queries are matched, and else for the number of pairs.
             traced = self._trace(batch, wait=not {"objects", "shape"} & set(self.stage.terms))
-            with batches_counted_together(self.model):
-                raw = self._run_model(batch, traced._replace(fits=None))
+            raw = self._run_model(batch, traced._replace(fits=None))
             losses = self._losses(raw, batch, mean_over_ranks=over_ranks)
         if traced.fits is not None:
             # A step that lacks pairs is skipped, like one that is not finite.
