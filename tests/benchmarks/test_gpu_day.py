@@ -150,6 +150,7 @@ STEPS = {"raises": "kernels", "dies": "waits", "hangs": "training", "well": "bar
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_what_ends_badly_stops_nothing_else(tmp_path):
     script, folder = tmp_path / "day.py", tmp_path / "report"
     folder.mkdir()

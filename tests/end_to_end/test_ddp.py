@@ -104,6 +104,7 @@ def test_ranks_with_batch_norms_of_their_own_train_one_network(curriculum, steps
 
 
 @pytest.mark.slow
+@pytest.mark.nightly
 def test_torchruns_ranks_share_one_folder(steps, tmp_path):
     """Each is a command of its own, with a clock of its own."""
     launcher = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
