@@ -125,6 +125,17 @@ def test_validation_does_not_depend_on_what_comes_twice(batch, make_module, monk
     assert validate(module, [batch, other, other]) != once
 
 
+def test_the_optimiser_is_fused_unless_a_scaler_or_an_apple_gpu_forbids_it(batch, make_module, monkeypatch):
+    module = make_module("stage1")
+    trainer = fit(module, batch, max_steps=1)
+    assert trainer.optimizers[0].defaults["fused"] is True
+    with monkeypatch.context() as context:
+        context.setattr(trainer.precision_plugin, "scaler", object(), raising=False)
+        assert module.configure_optimizers()["optimizer"].defaults["fused"] is False
+    monkeypatch.setattr(type(module), "device", torch.device("mps"))
+    assert module.configure_optimizers()["optimizer"].defaults["fused"] is False
+
+
 def validate(module, batches):
     trainer = pl.Trainer(
         accelerator="cpu",

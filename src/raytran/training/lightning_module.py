@@ -130,9 +130,11 @@ class Reconstruction(pl.LightningModule):
     def configure_optimizers(self) -> Any:
         """Return AdamW over what the stage trains, with its schedule.
 
-        Fused, all parameters in one pass, but not in 16-mixed: its scaler lets no fused optimiser clip.
+        Fused, all parameters in one pass, but not in 16-mixed, whose scaler lets no fused optimiser clip, nor
+        on Apple's GPUs, where nobody has tried it.
         """
-        fused = getattr(self.trainer.precision_plugin, "scaler", None) is None
+        scales = getattr(self.trainer.precision_plugin, "scaler", None) is not None
+        fused = self.device.type != "mps" and not scales
         steps = int(self.trainer.estimated_stepping_batches)
         return self.optimization.build(self.model.parameters(), steps, fused=fused)
 
