@@ -122,6 +122,25 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@pytest.fixture(scope="session")
+def small_rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The root of a data set with a room to train on and one to validate, of four frames of 32 × 32."""
+    root = tmp_path_factory.mktemp("small") / "rooms"
+    generate_rooms(
+        root,
+        num_train=1,
+        num_val=1,
+        frames=4,
+        image_size=(32, 32),
+        min_objects=3,
+        max_objects=3,
+        room_size=((3.0, 3.5), (3.0, 3.5)),
+        processes=1,
+        progress=False,
+    )
+    return root
+
+
 @pytest.fixture
 def write_scan(tmp_path: Path) -> Callable[..., Path]:
     """Write a scan whose frame ``n`` is a plain grey of value ``n`` seen from (n/100, 0, 1)."""

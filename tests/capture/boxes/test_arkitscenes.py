@@ -41,7 +41,9 @@ def released(rooms, tmp_path_factory):
 
 def prepare(root, output, **options):
     found = find_arkitscenes(root, CATEGORIES, **options)
-    return prepare_boxes(output, found.scans, SETTINGS, left_out=found.left_out, processes=1, progress=False)
+    return prepare_boxes(
+        output, found.sources, SETTINGS, left_out=found.left_out, processes=1, progress=False
+    )
 
 
 @pytest.fixture(scope="module")
@@ -122,15 +124,17 @@ def test_labels_of_no_class_are_left_out_and_named(prepared, rooms):
     ("place", "count"), [(".", 3), ("3dod", 3), ("3dod/Training", 2), ("3dod/Training/40000001", 1)]
 )
 def test_any_folder_of_a_download_will_do(released, place, count):
-    scans = find_arkitscenes(released / place, CATEGORIES).scans
+    scans = find_arkitscenes(released / place, CATEGORIES).sources
     assert [scan.scene_id for scan in scans] == sorted(HELD)[:count]
     assert [scan.split for scan in scans] == ["train", "train", "val"][:count]
 
 
 def test_scans_are_chosen_by_name_and_split(released):
-    assert [s.scene_id for s in find_arkitscenes(released, CATEGORIES, splits=["val"]).scans] == ["40000003"]
+    assert [s.scene_id for s in find_arkitscenes(released, CATEGORIES, splits=["val"]).sources] == [
+        "40000003"
+    ]
     found = find_arkitscenes(released, CATEGORIES, scenes=["4*2"])
-    assert [scan.scene_id for scan in found.scans] == ["40000002"]
+    assert [scan.scene_id for scan in found.sources] == ["40000002"]
     with pytest.raises(DataError, match=r"no scan in .* is called 5"):
         find_arkitscenes(released, CATEGORIES, scenes=["5*"])
     with pytest.raises(ConfigError, match=r"unknown splits"):

@@ -26,7 +26,7 @@ KINDS = ("colmap", "tum", "video", "video file")
 def prepare(folder, output, **options):
     found = find_captures(folder, CATEGORIES)
     return prepare_boxes(
-        output, found.captures, SETTINGS, left_out=found.left_out, processes=1, progress=False, **options
+        output, found.sources, SETTINGS, left_out=found.left_out, processes=1, progress=False, **options
     )
 
 
@@ -110,9 +110,9 @@ def test_boxes_are_turned_with_a_world_that_is_not_upright(rooms, tmp_path):
     write_capture(turned, tmp_path / "captures" / "upright", "tum")
     # As predict would write them: in the world that it turned upright.
     found = find_captures(tmp_path / "captures", CATEGORIES)
-    with found.captures[1].open() as scan:
+    with found.sources[1].open() as scan:
         moved = scan.world_from_input
-    upright = found.captures[0].read_objects(scan)
+    upright = found.sources[0].read_objects(scan)
     np.testing.assert_allclose(moved[:3, 2].numpy(), [0, 0, -1], atol=1e-6)
     entries = [
         {"category": c, "center": center.tolist(), "size": size.tolist(), "rotation": rotation.tolist()}
@@ -122,8 +122,8 @@ def test_boxes_are_turned_with_a_world_that_is_not_upright(rooms, tmp_path):
     ]
     (lists / "upright.json").write_text(json.dumps({"up": "+z", "objects": entries}))
     again = find_captures(tmp_path / "captures", CATEGORIES, boxes=lists)
-    assert again.captures[1].boxes == lists / "upright.json"
-    prepare_boxes(tmp_path / "out", again.captures, SETTINGS, processes=1, progress=False, val_share=0)
+    assert again.sources[1].boxes == lists / "upright.json"
+    prepare_boxes(tmp_path / "out", again.sources, SETTINGS, processes=1, progress=False, val_share=0)
     first, second = (scene_of(tmp_path / "out", "train", name) for name in ("poses", "upright"))
     torch.testing.assert_close(first.objects[0].center, second.objects[0].center)
     torch.testing.assert_close(first.foreground, second.foreground)

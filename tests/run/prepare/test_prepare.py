@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from raytran.capture.boxes.arkitscenes import FoundScans
 from raytran.data.prepare import Prepared
+from raytran.data.prepare.boxed_scan import FoundSources
 from raytran.errors import ConfigError, DataError
 from raytran.run.entry import compose
 from raytran.run.prepare import prepare as module
@@ -147,7 +147,7 @@ def test_arkitscenes_and_its_classes_from_the_command_line(monkeypatch, caplog, 
 
     def find(root, categories, **options):
         calls.append((root, categories, options))
-        return FoundScans((), (), ("1",))
+        return FoundSources((), (), ("1",))
 
     monkeypatch.setattr(module, "find_arkitscenes", find)
     report = Prepared(tmp_path, {}, "report")

@@ -11,29 +11,15 @@ from omegaconf import OmegaConf
 
 from raytran.checkpoints.runs import LAST
 from raytran.errors import ConfigError
-from raytran.rooms.generate import generate_rooms
 from raytran.run.entry import compose
 from raytran.run.train import learning_rate
 from raytran.run.train.fit import train
 
 
 @pytest.fixture(scope="module")
-def settings(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("rooms")
-    generate_rooms(
-        folder,
-        num_train=1,
-        num_val=1,
-        frames=4,
-        image_size=(32, 32),
-        min_objects=3,
-        max_objects=3,
-        room_size=((3.0, 3.5), (3.0, 3.5)),
-        processes=1,
-        progress=False,
-    )
+def settings(small_rooms):
     return [
-        *("preset=tiny", f"data.root={folder}", "trainer=cpu", "experiment=stage1", "progress_bar=none"),
+        *("preset=tiny", f"data.root={small_rooms}", "trainer=cpu", "experiment=stage1", "progress_bar=none"),
         *("views.image_size=[32,32]", "views.num_views=2", "views.predict_views=2", "watch.pictures=0"),
         *("model.grid_resolution=[8,8,4]", "trainer.max_steps=2", "trainer.val_check_interval=2"),
     ]

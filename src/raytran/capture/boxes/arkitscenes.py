@@ -23,8 +23,8 @@ from raytran.capture.boxes.box_list import read_mesh_file
 from raytran.capture.boxes.categories import Categories
 from raytran.capture.open import open_scene
 from raytran.capture.orientation import WorldSettings
-from raytran.data.cache import digest, file_digest
 from raytran.data.prepare.boxed_objects import BoxedObjects
+from raytran.data.prepare.boxed_scan import FoundSources
 from raytran.data.scan import OpenScan
 from raytran.data.text import read_json_object
 from raytran.errors import ConfigError, DataError
@@ -80,10 +80,7 @@ class ArkitScan:
     @property
     def state(self) -> str:
         """A digest of the annotation and of the classes."""
-        categories = self.categories
-        return digest(
-            file_digest(self.annotation), categories.classes.names, sorted(categories.renamed.items())
-        )
+        return self.categories.state_of(self.annotation)
 
     def open(self) -> OpenScan:
         """Open its frames; images that are stored on their side are turned upright.
@@ -124,36 +121,13 @@ class ArkitScan:
         return objects.moved(scan.world_from_input)
 
 
-@dataclass(frozen=True)
-class FoundScans:
-    """The scans below a folder.
-
-    Attributes:
-        scans: with an annotation, in the order of their names.
-        without_boxes: names of those without.
-        without_frames: annotations of scans without frames.
-    """
-
-    scans: tuple[ArkitScan, ...]
-    without_boxes: tuple[str, ...]
-    without_frames: tuple[str, ...]
-
-    @property
-    def left_out(self) -> Mapping[str, Any]:
-        """What is not prepared, by the keys of the report."""
-        return {
-            "scans_without_boxes": list(self.without_boxes),
-            "boxes_without_scan": list(self.without_frames),
-        }
-
-
 def find_arkitscenes(
     root: Path,
     categories: Categories,
     *,
     scenes: Sequence[str] | None = None,
     splits: Sequence[str] = ("train", "val"),
-) -> FoundScans:
+) -> FoundSources:
     """Find the scans below a folder of downloads.
 
     Args:
@@ -190,7 +164,7 @@ def find_arkitscenes(
             without_boxes.append(path.name)
     if not scans:
         raise _no_scan(root, without_boxes, without_frames)
-    return FoundScans(tuple(scans), tuple(without_boxes), tuple(without_frames))
+    return FoundSources(tuple(scans), tuple(without_boxes), tuple(without_frames))
 
 
 def _no_scan(root: Path, without_boxes: list[str], without_frames: list[str]) -> DataError:

@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from raytran.capture.boxes.box_list import BoxList, boxed_objects, read_box_list, read_mesh_file
 from raytran.capture.boxes.categories import Categories
@@ -15,10 +13,9 @@ from raytran.capture.open import open_scene, parse_intrinsics
 from raytran.capture.orientation import WorldSettings
 from raytran.capture.packed import PACKED_ENDINGS
 from raytran.capture.video import VIDEO_ENDINGS
-from raytran.data.cache import digest, file_digest
 from raytran.data.prepare.boxed_mesh import Mesh
 from raytran.data.prepare.boxed_objects import BoxedObjects
-from raytran.data.prepare.boxed_scan import scene_name
+from raytran.data.prepare.boxed_scan import FoundSources, scene_name
 from raytran.data.scan import OpenScan
 from raytran.errors import ConfigError, DataError
 
@@ -68,8 +65,7 @@ class Capture:
     @property
     def state(self) -> str:
         """A digest of the list and of the settings that it is read with."""
-        categories = self.categories
-        return digest(file_digest(self.boxes), categories.classes.names, sorted(categories.renamed.items()))
+        return self.categories.state_of(self.boxes)
 
     def open(self) -> OpenScan:
         """Open its frames, as ``predict`` would with the settings in the list.
@@ -124,30 +120,7 @@ class Capture:
         return None if found is None else read_mesh_file(found)
 
 
-@dataclass(frozen=True)
-class Found:
-    """The captures below a folder.
-
-    Attributes:
-        captures: with a list of boxes, by name.
-        without_boxes: names of those without.
-        without_frames: lists that belong to no capture.
-    """
-
-    captures: tuple[Capture, ...]
-    without_boxes: tuple[str, ...]
-    without_frames: tuple[str, ...]
-
-    @property
-    def left_out(self) -> Mapping[str, Any]:
-        """What is not prepared, by the keys of the report."""
-        return {
-            "scans_without_boxes": list(self.without_boxes),
-            "boxes_without_scan": list(self.without_frames),
-        }
-
-
-def find_captures(root: Path, categories: Categories, *, boxes: Path | None = None) -> Found:
+def find_captures(root: Path, categories: Categories, *, boxes: Path | None = None) -> FoundSources:
     """Find the captures in a folder and the list of boxes of each.
 
     A capture is a folder, or a video, a recording or an archive. Its list is ``boxes.json`` or
@@ -182,7 +155,7 @@ def find_captures(root: Path, categories: Categories, *, boxes: Path | None = No
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise DataError(f"two captures in {root} are called {twice}: rename one")
-    return Found(
+    return FoundSources(
         captures, tuple(path.name for path, listed in lists.items() if listed is None), tuple(orphans)
     )
 

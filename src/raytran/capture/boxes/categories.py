@@ -5,8 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
 
 from raytran.classes import Classes
+from raytran.data.cache import digest, file_digest
 from raytran.errors import ConfigError, DataError
 from raytran.limits import shown
 
@@ -47,18 +50,27 @@ class Categories:
         Raises:
             DataError: it is no class.
         """
-        if isinstance(category, str):
-            known = {_plain(name): name for name in self.classes.names}
-            for name, catids in zip(self.classes.names, self.classes.catids, strict=True):
-                known = {_plain(catid): name for catid in catids} | known
-            renamed = {_plain(name): own for name, own in self.renamed.items()}
-            found = renamed.get(_plain(category), known.get(_plain(category)))
-            if found is not None or _plain(category) in renamed or self.unknown_left_out:
-                return found
+        if isinstance(category, str) and (_plain(category) in self._class_by_name or self.unknown_left_out):
+            return self._class_by_name.get(_plain(category))
         raise DataError(
             f"{where} is of category {shown(category)}, which is no class: choose one of {self.classes}, "
             "name yours in classes.names=[…], or map it with categories={name: class}"
         )
+
+    def state_of(self, annotation: Path) -> str:
+        """Return a digest of an annotation's file and of what its categories count as."""
+        return digest(file_digest(annotation), self.classes.names, sorted(self.renamed.items()))
+
+    @cached_property
+    def _class_by_name(self) -> Mapping[str, str | None]:
+        """What each name counts as: as it was renamed, else the class of that name, else of that category."""
+        # Of two that read the same, the first listed counts.
+        pairs = reversed([*zip(self.classes.names, self.classes.catids, strict=True)])
+        return {
+            **{_plain(catid): name for name, catids in pairs for catid in catids},
+            **{_plain(name): name for name in self.classes.names},
+            **{_plain(name): own for name, own in self.renamed.items()},
+        }
 
 
 def _plain(name: str) -> str:

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import re
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -68,6 +69,29 @@ class AnnotatedSource(Protocol):
         Raises:
             DataError: the annotation is damaged, or says what cannot be.
         """
+
+
+@dataclass(frozen=True)
+class FoundSources:
+    """The scans below a folder.
+
+    Attributes:
+        sources: with boxes and frames, in the order of their names.
+        without_boxes: names of scans without boxes.
+        without_frames: annotations of scans without frames.
+    """
+
+    sources: tuple[AnnotatedSource, ...]
+    without_boxes: tuple[str, ...]
+    without_frames: tuple[str, ...]
+
+    @property
+    def left_out(self) -> Mapping[str, Any]:
+        """What is not prepared, by the keys of the report."""
+        return {
+            "scans_without_boxes": list(self.without_boxes),
+            "boxes_without_scan": list(self.without_frames),
+        }
 
 
 def scene_name(name: str) -> str:

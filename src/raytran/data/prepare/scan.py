@@ -145,7 +145,8 @@ def write_scan(
     pose = scan.world_from_camera[used]
     cameras = scan.cameras[used].scaled_to(settings.image_size)
     _write_camera_facts(folder, cameras, scan.axis_alignment)
-    _write_frame_cameras(folder, cameras, [frame_names(scan.frame_id)[position] for position in used])
+    names = frame_names(scan.frame_id)
+    _write_frame_cameras(folder, cameras, [names[position] for position in used])
     write_json(
         folder / FACTS,
         {

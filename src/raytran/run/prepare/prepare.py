@@ -140,7 +140,7 @@ def _prepare_captures(settings: dict[str, Any], output: Path) -> Any:
     found = find_captures(Path(settings["captures"]), _categories(settings), boxes=_path(settings["boxes"]))
     seed = settings["seed"] if settings["seed"] is not None else 0
     return _prepare_boxes(
-        settings, output, found.captures, found.left_out, val_share=settings["val_share"], seed=seed
+        settings, output, found.sources, found.left_out, val_share=settings["val_share"], seed=seed
     )
 
 
@@ -154,7 +154,7 @@ def _prepare_arkitscenes(settings: dict[str, Any], output: Path) -> Any:
         scenes=settings["scenes"],
         splits=settings["splits"],
     )
-    return _prepare_boxes(settings, output, found.scans, found.left_out)
+    return _prepare_boxes(settings, output, found.sources, found.left_out)
 
 
 def _prepare_boxes(
