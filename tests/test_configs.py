@@ -39,6 +39,7 @@ WITHOUT_ARGUMENTS = {
     "raytran.extensions.proposal_queries.ProposalLoss",
     "raytran.extensions.denoising.DenoisingLoss",
     "raytran.extensions.box_refinement.BoxRefinement",
+    "raytran.extensions.box_voxels.BoxVoxelShapeHead",
 }
 # Part of the layout that scan2cad_dataset stands for.
 FIXED_BY_LAYOUT = {"scans_root", "scene_ids", "annotations", "shapenet_root"}
@@ -266,7 +267,7 @@ def settings_of_all_commands(project_root):
             "preset=tiny",
             "logger=many",
             "debug=profiler",
-            "model/extensions=[unet3d,denoising,box_refinement]",
+            "model/extensions=[unet3d,denoising,box_refinement,box_voxels]",
         ],
         ["preset=laptop", "data=scan2cad", "experiment=novel_view"],
     ]

@@ -95,6 +95,7 @@ VARIATIONS = {
         [DENOISING],
         (0,),
     ),
+    "shapes from boxes": ("stage3", "tiny", ["model/extensions=[proposal_queries,box_voxels]"], (3,)),
     "no objects' shapes": ("stage3", "tiny", [], (0, 0)),
     "blocks computed twice": ("stage2", "tiny", ["model.backbone.checkpoint_blocks=true"], (3,)),
     "masks as input": ("stage2", "tiny", ["model.backbone.encoder.input_channels=4"], (3,)),

@@ -152,7 +152,7 @@ class RayTran(nn.Module):
         voxels, pixels = self._run_backbone(views, traced, "foreground" in tasks, views_at_once)
         objects = ObjectOutputs(())
         if "objects" in tasks:
-            objects = self.heads["objects"](voxels, self._grid(traced.grid_center), true_objects)
+            objects = self._find_objects(voxels, self._grid(traced.grid_center), true_objects)
         return RawScene(
             grid_center=traced.grid_center,
             occupancy=self.heads["occupancy"](voxels) if "occupancy" in tasks else None,
@@ -163,6 +163,16 @@ class RayTran(nn.Module):
             new_views=self._render(voxels, traced, new_cameras) if "view" in tasks else None,
             voxels=voxels,
         )
+
+    def _find_objects(
+        self, voxels: Tensor, grid: VoxelGrid, true_objects: Sequence[ObjectSet] | None
+    ) -> ObjectOutputs:
+        """Run the object head, and read the voxels in its boxes for a shape head that asks for them."""
+        objects: ObjectOutputs = self.heads["objects"](voxels, grid, true_objects)
+        read_boxes = getattr(self.heads["shape"] if "shape" in self.heads else None, "with_box_voxels", None)
+        if read_boxes is None:
+            return objects
+        return objects._replace(layers=tuple(read_boxes(layer, voxels, grid) for layer in objects.layers))
 
     def _grid(self, center: Tensor) -> VoxelGrid:
         return VoxelGrid(self.grid_resolution, self.grid_extent, center)

@@ -35,6 +35,7 @@ PARTS: dict[str, str] = {
     "VoxelAttention": "raytran.heads.decoder",
     "ShapeHead": "raytran.heads.shape",
     "ViewHead": "raytran.heads.view",
+    "BoxVoxelShapeHead": "raytran.extensions.box_voxels",
     "BoxRefinement": "raytran.extensions.box_refinement",
     "DenoisingObjectHead": "raytran.extensions.denoising",
     "EfficientNetLite0": "raytran.extensions.efficientnet",

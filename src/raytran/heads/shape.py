@@ -39,6 +39,11 @@ class ShapeHead(nn.Module):
         ]
         self.upsampler = nn.Sequential(*layers)
 
+    @property
+    def in_channels(self) -> int:
+        """Numbers of each object that ``forward`` reads."""
+        return self.start.in_features
+
     def forward(self, embedding: Tensor) -> Tensor:
         """Map embeddings ``(M, C)`` to occupancy logits ``(M, 63, 63, 63)``, indexed [x, y, z]."""
         start = self.start(embedding).view(-1, self.widths[0], 4, 4, 4)
