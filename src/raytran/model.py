@@ -169,10 +169,12 @@ class RayTran(nn.Module):
     ) -> ObjectOutputs:
         """Run the object head, and read the voxels in its boxes for a shape head that asks for them."""
         objects: ObjectOutputs = self.heads["objects"](voxels, grid, true_objects)
-        read_boxes = getattr(self.heads["shape"] if "shape" in self.heads else None, "with_box_voxels", None)
-        if read_boxes is None:
+        if "shape" not in self.heads:
             return objects
-        return objects._replace(layers=tuple(read_boxes(layer, voxels, grid) for layer in objects.layers))
+        read = getattr(self.heads["shape"], "with_box_voxels", None)
+        if read is None:
+            return objects
+        return objects._replace(layers=tuple(read(layer, voxels, grid) for layer in objects.layers))
 
     def _grid(self, center: Tensor) -> VoxelGrid:
         return VoxelGrid(self.grid_resolution, self.grid_extent, center)

@@ -9,7 +9,8 @@ import torch
 from raytran.extensions.box_voxels import CELLS, BoxVoxelShapeHead, box_points, read_voxels
 from raytran.geometry.grid import VoxelGrid
 from raytran.structs import RawObjects
-from tests.factories import CHANNELS, make_model, make_views
+
+from ..factories import CHANNELS, make_model, make_views
 
 
 def _objects(center: torch.Tensor, size: torch.Tensor, yaw: torch.Tensor, channels: int = 3) -> RawObjects:

@@ -165,7 +165,9 @@ def export_shapes(model: RayTran) -> ExportedProgram:
     """
     if "shape" not in model.heads:
         raise ConfigError("this network has no shape head: export program.part=network")
-    embedding = torch.zeros(3, model.heads["shape"].in_channels)
+    # A shape head of the user's own need not tell.
+    read = int(getattr(model.heads["shape"], "in_channels", model.backbone.channels))
+    embedding = torch.zeros(3, read)
     objects = Dim("objects", min=1)
     program = torch.export.export(model.heads["shape"], (embedding,), dynamic_shapes=({0: objects},))
     return program.run_decompositions({})

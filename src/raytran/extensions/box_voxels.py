@@ -69,7 +69,7 @@ class BoxVoxelShapeHead(ShapeHead):
 
 
 def box_points(objects: RawObjects, cells: int) -> Tensor:
-    """Return the centres of ``cells``³ cells of each predicted box, ``(B, Q, cells³, 3)`` metres, z fastest."""
+    """Return the centres of ``cells``³ cells of each box, ``(B, Q, cells³, 3)`` metres, z fastest."""
     log_size = objects.log_size
     axis = (torch.arange(cells, dtype=log_size.dtype, device=log_size.device) + 0.5) / cells - 0.5
     unit = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).reshape(-1, 3)
