@@ -61,6 +61,29 @@ def test_a_stage_starts_from_its_parent_and_keeps_what_is_frozen(trained):
     assert same_weights(fits[0].checkpoint, fits[1].checkpoint, "model.heads.shape.")
 
 
+def test_a_trained_head_is_exchanged_where_that_is_asked_for(trained, settings, tmp_path):
+    """Another shape head, which reads boxes, on the network of a finished curriculum; then it predicts."""
+    parent = trained[1][2].checkpoint
+    other = [
+        *settings,
+        "experiment=stage3",
+        f"init_from={parent}",
+        "check_parent=none",
+        "model/extensions=[proposal_queries,windowed_attention,box_voxels]",
+        "trainer.max_steps=2",
+    ]
+    with pytest.raises(CheckpointError, match="do not fit this model"):
+        fit(other, tmp_path / "refused")
+    with pytest.raises(ConfigError, match=r"restarted_parts names 'backbone', which stage3 does not train"):
+        fit([*other, "stage.restarted_parts=[backbone]"], tmp_path / "frozen")
+    run = fit([*other, "stage.restarted_parts=[heads.shape]"], tmp_path / "run")
+    kept = same_weights(parent, run.checkpoint)
+    assert {"model.backbone.unseen", "model.heads.objects.position.weight"} <= kept
+    assert not any(name.startswith("model.heads.shape.start") for name in kept)
+    model = raytran.load(run.checkpoint)
+    assert type(model.heads["shape"]).__name__ == "BoxVoxelShapeHead"
+
+
 def test_a_finished_curriculum_is_not_trained_again(trained, settings):
     folder, fits = trained
     before = [fit.checkpoint.stat().st_mtime_ns for fit in fits]

@@ -30,6 +30,8 @@ class Stage:
         trainable: names of the model's parts that train, e.g. ``heads.shape``; all others are frozen and in
             evaluation mode, so that batch-norm statistics stay as they are.
         fresh_parts: names of the parts that start at random where the parent has none.
+        restarted_parts: names of parts that start at random whatever the parent has, e.g. a head that is to
+            have another form.
         new_views: frames of each scene that are held out to be rendered.
         freeze_norms: train with the batch-norm statistics that predictions use, and leave them as they are. A
             network that is trained on, with few scenes a step, then learns with what it predicts with.
@@ -46,6 +48,7 @@ class Stage:
     trainable: Sequence[str]
     other_parents: Sequence[str] = ()
     fresh_parts: Sequence[str] = ()
+    restarted_parts: Sequence[str] = ()
     new_views: int = 0
     freeze_norms: bool = False
 
@@ -55,12 +58,19 @@ class Stage:
         Parts that the stage's tasks never reach are frozen too: without a gradient DDP would wait for them.
 
         Raises:
-            ConfigError: a name in ``trainable`` is not a part of the model.
+            ConfigError: a name in ``trainable`` is not a part of the model, or one in ``restarted_parts`` is
+                none that trains.
         """
         names = {name for name, _ in model.named_modules()}
         for part in self.trainable:
             if part not in names:
                 raise ConfigError(f"{self.name} trains '{part}', which the model does not have")
+        for part in self.restarted_parts:
+            if part not in names or not is_within(part, self.trainable):
+                raise ConfigError(
+                    f"stage.restarted_parts names '{part}', which {self.name} does not train: "
+                    f"choose from what it trains, {', '.join(self.trainable)}"
+                )
         idle = self._idle(model)
         for name, parameter in model.named_parameters():
             parameter.requires_grad_(is_within(name, self.trainable) and not is_within(name, idle))

@@ -80,6 +80,8 @@ class StageCallback(pl.Callback):
 
     def _take_weights(self, module: Reconstruction, path: Path, content: Mapping[str, Any]) -> None:
         model, stage = module.model, module.stage
+        for part in stage.restarted_parts:
+            _log.info("%s starts at random, as stage.restarted_parts asks", part)
         fresh = fresh_parts(model, content, stage.fresh_parts)
         of_classes = set(model.class_layers())
         for part in fresh:
@@ -93,7 +95,7 @@ class StageCallback(pl.Callback):
                 len(model.classes),
                 difference,
             )
-        load_weights(module.model, content, path, fresh=fresh)
+        load_weights(module.model, content, path, fresh=[*fresh, *stage.restarted_parts])
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Find the mode of each module; the ranks' batch norms have been exchanged by now."""
