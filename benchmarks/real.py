@@ -14,14 +14,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
 from real_rows import KEY, keep_row
-from record import circumstances
+from record import circumstances, read_rows
 
 from raytran.checkpoints.file import checkpoint_path, file_digest
 from raytran.classes import OTHER, PAPER_CLASSES
@@ -83,10 +83,15 @@ def of_rooms(trial: Trial, root: Path) -> Figures:
 
 
 def of_furniture(trial: Trial, root: Path) -> Figures:
-    """Return what ``evaluate`` says of the rooms with other furniture, with the calibration."""
+    """Return what ``evaluate`` says of the rooms with other furniture, with the calibration.
+
+    Generated pieces fill up where there are few given ones of a kind: the accuracy of the given is apart.
+    """
     metrics = _evaluated(trial, root, "furniture")
     calibration = metrics["strict"]["calibration"]
+    of_object = trial.folder / "furniture" / "per_object.csv"
     return _figures("furniture", metrics) | {
+        "furniture_given_accuracy": accuracy_of_given(root, read_rows(of_object)),
         "furniture_calibration": calibration["counted"]["expected_error"],
         "furniture_calibration_every": calibration["every_score"]["expected_error"],
     }
@@ -134,6 +139,23 @@ MEASURES: dict[str, Callable[[Trial, Path], Figures]] = {
     "lounge": of_lounge,
 }
 """Case, which is the option that names its folder → what measures it."""
+
+
+def accuracy_of_given(root: Path, objects: Sequence[Mapping[str, str]]) -> float | None:
+    """Return the share of right ones among the pieces that were given and not generated; None without any.
+
+    Args:
+        root: rooms that were furnished with given CAD models.
+        objects: rows of ``per_object.csv`` of these rooms.
+    """
+    given = {model["model_id"] for model in json.loads((root / "cads.json").read_text())["models"]}
+    scenes = read_annotations(root / "scan2cad" / "full_annotations.json")
+    right = [
+        row["matched"] == "True"
+        for row in objects
+        if scenes[row["scene_id"]].model_id[int(row["object"])].partition("/")[2] in given
+    ]
+    return sum(right) / len(right) if right else None
 
 
 def overlaps_any(predicted: ObjectSet, true: ObjectSet) -> torch.Tensor:

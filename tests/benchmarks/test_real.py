@@ -46,6 +46,15 @@ def test_a_piece_is_found_by_one_near_object_of_its_class():
     assert real.pieces_found(ObjectSet.empty(), *pieces) == 0
 
 
+def test_given_pieces_are_told_from_generated_ones(tmp_path, write_annotations, cube_entry):
+    write_annotations({"a": [cube_entry(), cube_entry(id_cad="other")], "b": [cube_entry()]})
+    (tmp_path / "cads.json").write_text(json.dumps({"models": [{"model_id": "cube"}]}))
+    found = [("a", "0", "True"), ("a", "1", "True"), ("b", "0", "False")]
+    rows = [dict(zip(("scene_id", "object", "matched"), row, strict=True)) for row in found]
+    assert real.accuracy_of_given(tmp_path, rows) == 0.5
+    assert real.accuracy_of_given(tmp_path, rows[1:2]) is None
+
+
 @pytest.fixture
 def folders(tmp_path, write_annotations, cube_entry):
     """The real cases, with nothing to see: the commands are pretended."""
@@ -56,6 +65,8 @@ def folders(tmp_path, write_annotations, cube_entry):
     ]
     (tmp_path / "lounge" / "boxes.json").write_text(json.dumps({"objects": pieces}))
     write_annotations({"scene0470_00": [cube_entry()]}, root=tmp_path / "scan")
+    write_annotations({"scene9500_00": [cube_entry()]}, root=tmp_path / "furniture")
+    (tmp_path / "furniture" / "cads.json").write_text(json.dumps({"models": [{"model_id": "cube"}]}))
     return {name: tmp_path / name for name in ("rooms", "furniture", "scan", "lounge")}
 
 
@@ -78,8 +89,9 @@ def commands(monkeypatch):
         output.mkdir(parents=True)
         if words[0] == "evaluate":
             (output / "metrics.json").write_text(json.dumps({"strict": strict, "shape": shape}))
+            (output / "per_object.csv").write_text("scene_id,object,matched\nscene9500_00,0,True\n")
             return
-        found = boxes([CHAIR, OTHER, CHAIR], [[0.2, 0, 0], [2.3, 0, 0], [8, 0, 0]])
+        found = boxes([CHAIR, OTHER, CHAIR], [[0.2, 0, 0], [2.3, 0, 0.2], [8, 0, 0]])
         prediction = ScenePrediction("walk", found, torch.zeros(3))
         write_scene_json(output / "scene.json", prediction, [None] * 3)
 
@@ -95,14 +107,14 @@ def measure(monkeypatch, table, folders, *words):
 
 
 def test_a_row_has_all_cases_and_is_replaced(commands, folders, tmp_path, monkeypatch, capsys):
-    for name in ("rooms", "furniture"):
-        folders[name].mkdir()
+    folders["rooms"].mkdir()
     table = tmp_path / "real.csv"
     (row,) = measure(monkeypatch, table, folders, "--scenes", "3")
     assert row["sha256"] == file_digest(checkpoint_path("default"))[:12]
     assert (row["scenes"], row["num_views"], row["score_threshold"]) == ("3", "24", "0.5")
     assert (row["rooms_accuracy"], row["rooms_shape_iou"], row["rooms_chair_iou"]) == ("0.5", "0.4", "0.2")
     assert (row["furniture_calibration"], row["furniture_calibration_every"]) == ("0.2", "0.1")
+    assert row["furniture_given_accuracy"] == "1.0"
     assert (row["scan_f1"], row["scan_in_nothing"]) == ("0.6", "2")
     assert (row["lounge_right"], row["lounge_true"], row["lounge_predicted"]) == ("2", "2", "3")
     of_rooms = next(words for words in commands if f"data.root={folders['rooms']}" in words)
