@@ -73,6 +73,7 @@ SCORE = Quantity("a score", -1e6, 1e6)
 """Confidence; only its order counts, and programs write logits too."""
 
 SHARE = Quantity("a share", 0, 1)
+LOG_ODDS = Quantity("a logarithm of odds", -1e3, 1e3)
 FOCAL_LENGTH = Quantity("a focal length in pixels", 1e-2, 1e7)
 PIXEL = Quantity("a pixel coordinate", -1e6, 1e6)
 SIDE = Quantity("a number of pixels", 1, MAX_SIDE)

@@ -22,6 +22,7 @@ from raytran.geometry.camera import Cameras
 from raytran.geometry.checks import check_views
 from raytran.geometry.grid import VoxelGrid, checked_grid
 from raytran.heads.objects import ObjectOutputs, objects_of_queries
+from raytran.heads.score_scaling import ScoreScaling
 from raytran.ops.pairs import Pairs
 from raytran.ops.traverse import Attention, RayTracer, count_views
 from raytran.setting_limits import check_settings
@@ -71,6 +72,8 @@ class RayTran(nn.Module):
         attention: what computes ray-traced attention: ``fused`` Triton kernels, products of ``torch.sparse``
             (``sparse``), or the former where they run and the latter elsewhere (``auto``).
         classes: of the objects, or their settings, see ``Classes.of``; None: the paper's nine.
+        score_scaling: from the probability of an object's class to its score, or its settings, see
+            ``ScoreScaling``; None: they are one. It is fitted to a network that is trained.
 
     Raises:
         ConfigError: the foreground or view head does not grow the features back to image size, there is no
@@ -87,9 +90,11 @@ class RayTran(nn.Module):
         rays_per_cell: int = 2,
         attention: Attention = "auto",
         classes: Classes | Mapping[str, Any] | None = None,
+        score_scaling: ScoreScaling | Mapping[str, Any] | None = None,
     ) -> None:
         super().__init__()
         self.classes = Classes.of(classes)
+        self.score_scaling = ScoreScaling.of(score_scaling)
         # An object head of the user's own need not tell.
         of_head = getattr(heads["objects"], "num_classes", None) if "objects" in heads else None
         if of_head not in (None, len(self.classes)):
@@ -400,7 +405,11 @@ class RayTran(nn.Module):
         if raw.objects is None:
             return ObjectSet.empty(self.classes).to(raw.grid_center.device)
         objects, embedding = objects_of_queries(
-            raw.objects[-1], scene, score_threshold=score_threshold, classes=self.classes
+            raw.objects[-1],
+            scene,
+            score_threshold=score_threshold,
+            classes=self.classes,
+            score_scaling=self.score_scaling,
         )
         if not with_shapes or "shape" not in self.heads:
             return objects

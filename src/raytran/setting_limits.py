@@ -61,6 +61,7 @@ _COUNTS: dict[str, tuple[int, int]] = {
     # data and scores
     **dict.fromkeys(("num_train", "num_val", "num_test"), (0, _ROOMS)),
     **dict.fromkeys(("min_objects", "max_objects"), (0, 1000)),
+    "max_scenes": (1, _ROOMS),
     "checks": (1, _ROOMS),
     "num_resamples": (1, 100_000),
 }

@@ -278,6 +278,7 @@ def test_evaluate_writes_numbers(trained, rooms, tmp_path, command):
         "metrics.json",
         "per_object.csv",
         "per_scene.csv",
+        "reliability.png",
     ]
 
 

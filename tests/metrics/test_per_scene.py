@@ -27,6 +27,7 @@ from raytran.metrics import (
     OrientedBoxF1,
     Scan2CADAccuracy,
     SceneOccupancyIoU,
+    ScoreCalibration,
 )
 from raytran.metrics.accuracy_curves import AccuracyCurves
 from raytran.metrics.error_atlas import ErrorAtlas
@@ -100,6 +101,7 @@ def results(indices: tuple[int, ...], dtype: torch.dtype = torch.float32) -> dic
     """Everything the metrics return for a share of the scenes, scenes given one by one."""
     of_objects = {"scan2cad": Scan2CADAccuracy(), "box_f1": OrientedBoxF1(), "shape": MatchedShapeScores()}
     of_objects |= {"map": MeanAveragePrecision(), "map_aligned": MeanAveragePrecision(boxes="axis_aligned")}
+    of_objects |= {"calibration": ScoreCalibration()}
     of_objects |= {"curves": AccuracyCurves(), "atlas": ErrorAtlas(volume_extent=(9.0, 9.0, 3.5))}
     truths = [cads(index)[1] for index in range(SCENES)]
     of_cads = {
@@ -154,6 +156,7 @@ def test_two_ranks_equal_one_process(share, found_by_ranks):
     expected = json.loads(json.dumps(results(tuple(range(SCENES)))))
     assert expected["scan2cad"]["n_good"] > 5
     assert 0 < expected["shape"]["iou"] < 1
+    assert 0 < expected["calibration"]["n_right"] < expected["calibration"]["n_predicted"]
     for key in ("official", "vid2cad"):
         assert 0 < expected[key]["n_good"] < expected[key]["n_total"]
     assert expected["odam"]["per_threshold"]["0.25"]["n_matched"] > 3

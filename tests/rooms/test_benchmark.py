@@ -16,6 +16,7 @@ from raytran.rooms.generate import generate_rooms
 from raytran.rooms.library import ModelPool
 from raytran.rooms.materials import texture_library
 from raytran.run.entry import compose
+from raytran.run.prepare.prepare import prepare
 
 HOW = {"processes": 1, "progress": False}
 SPLITS = ("train", "val", "test")
@@ -136,6 +137,20 @@ def test_furniture_rooms_use_all_given_models_and_are_for_tests_only(furnished, 
     assert (root / "shapenet" / "credits.csv").is_file()
     with pytest.raises(DataError, match=r"there is no .*scannetv2_val.txt"):
         scan2cad_dataset(root, "val", cache_dir=root / "cache")
+
+
+def test_the_held_out_part_has_no_model_of_training_rooms(tiny, cads, tmp_path):
+    """Through the command, so that the setting is seen to arrive."""
+    words = f"dataset=rooms-v1-furniture part=held_out cads={cads} output={tmp_path}/x num_test=1 processes=1"
+    report = prepare(compose("prepare", words.split()))
+    assert report.test == ("scene9500_00",)
+    split_of = {
+        path.parts[-3]: json.loads(path.read_text())["split"] for path in cads.rglob("model_normalized.json")
+    }
+    used = {model["id_cad"] for entry in entries(report.root) for model in entry["aligned_models"]}
+    assert {split_of[name] for name in used & set(split_of)} == {"val"}
+    with pytest.raises(DataError, match=r"other settings \(part\)"):
+        generate_rooms_v1_furniture(report.root, cads=cads, num_test=1, **HOW)
 
 
 def test_other_rooms_are_left_alone(made, furnished, cads, tmp_path):

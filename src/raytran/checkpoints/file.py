@@ -413,6 +413,12 @@ def _files() -> list[Path]:
     return sorted(FOLDER.glob(f"*{SUFFIX}"))
 
 
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a checkpoint's file, in hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
 def export_weights(checkpoint: Mapping[str, Any], source: Path, output: Path, *, dtype: str) -> None:
     """Write the network of a checkpoint to a safetensors file, without the state of training.
 

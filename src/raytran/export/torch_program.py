@@ -276,6 +276,7 @@ def _geometry(model: RayTran, image_size: tuple[int, int]) -> dict[str, Any]:
         "grid_resolution": list(model.grid_resolution),
         "grid_extent": list(model.grid_extent),
         "classes": [*model.classes.names, PADDING_NAME],
+        "score_scaling": None if model.score_scaling is None else model.score_scaling.settings(),
     }
 
 

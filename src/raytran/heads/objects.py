@@ -23,6 +23,7 @@ from raytran.heads.decoder import (
     in_product_dtype,
     keys_and_values_together,
 )
+from raytran.heads.score_scaling import ScoreScaling
 from raytran.norms import LayerNorm
 from raytran.structs import ObjectSet, RawObjects, RawProposals
 
@@ -337,15 +338,21 @@ def _perceptron(channels: int, outputs: int) -> nn.Sequential:
 
 
 def objects_of_queries(
-    raw: RawObjects, scene: int, *, score_threshold: float = 0.0, classes: Classes = PAPER_CLASSES
+    raw: RawObjects,
+    scene: int,
+    *,
+    score_threshold: float = 0.0,
+    classes: Classes = PAPER_CLASSES,
+    score_scaling: ScoreScaling | None = None,
 ) -> tuple[ObjectSet, Tensor]:
     """Return one scene's objects, highest score first, and their embeddings.
 
     Args:
         raw: one decoder layer's output for B scenes.
         scene: which of them.
-        score_threshold: queries whose best class has a lower probability are left out.
+        score_threshold: queries with a lower score are left out.
         classes: what the network's K outputs before padding stand for.
+        score_scaling: from the probability of the best class to the score; None: they are one.
 
     Returns:
         M objects without shapes, and ``(M, C)`` embeddings.
@@ -353,6 +360,8 @@ def objects_of_queries(
     probability = raw.class_logits[scene].softmax(dim=-1)[:, :-1]
     score, label = probability.max(dim=-1)
     order = score.argsort(descending=True, stable=True)
+    if score_scaling is not None:
+        score = score_scaling(score)
     order = order[score[order] >= score_threshold]
     sin, cos = raw.yaw_vector[scene, order].unbind(dim=-1)
     objects = ObjectSet(

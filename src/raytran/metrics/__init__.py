@@ -8,6 +8,7 @@ from raytran.metrics.error_atlas import ErrorAtlas
 from raytran.metrics.new_views import PSNR, SSIM, NewViewScores
 from raytran.metrics.occupancy_iou import ForegroundIoU, SceneOccupancyIoU
 from raytran.metrics.scan2cad import Scan2CADAccuracy
+from raytran.metrics.score_calibration import ScoreCalibration
 from raytran.metrics.shape import MatchedShapeScores
 
 __all__ = [
@@ -22,4 +23,5 @@ __all__ = [
     "OrientedBoxF1",
     "Scan2CADAccuracy",
     "SceneOccupancyIoU",
+    "ScoreCalibration",
 ]

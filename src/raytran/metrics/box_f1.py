@@ -11,7 +11,6 @@ from torch import Tensor
 
 from raytran.classes import PAPER_CLASSES
 from raytran.errors import ConfigError
-from raytran.geometry.boxes import OrientedBoxes, box_iou
 from raytran.metrics.functional.cad_errors import cad_half_extents
 from raytran.metrics.functional.detection import (
     BestScores,
@@ -19,6 +18,7 @@ from raytran.metrics.functional.detection import (
     average_precision,
     best_f1,
     detection_scores,
+    iou_within_class,
     match_in_order,
     score_order,
 )
@@ -118,10 +118,7 @@ class OrientedBoxF1(ProtocolMetric):
 
     def judge_objects(self, predictions: ObjectSet, targets: ObjectSet) -> tuple[Tensor, Tensor]:
         """Match by boxes."""
-        boxes_a = OrientedBoxes(predictions.center, predictions.size, predictions.rotation)
-        boxes_b = OrientedBoxes(targets.center, targets.size, targets.rotation)
-        iou, _ = box_iou(boxes_a, boxes_b)
-        iou = torch.where(predictions.label[:, None] == targets.label, iou, 0.0)
+        iou = iou_within_class(predictions, targets)
         order = score_order(predictions.score)
         best = torch.cat([iou, iou.new_zeros(1, len(targets))]).amax(dim=0)
         truths = [targets.label.double(), best]

@@ -35,6 +35,9 @@ SETTINGS = RoomSettings(
 TEST_FRAMES = 96
 """Frames of a test room, as many as the paper predicts from."""
 
+FURNITURE_PARTS = {"all": None, "held_out": "val"}
+"""Which of the given CAD models the second test set takes → their split; None for both."""
+
 # The ranges are fixed, so that a room does not depend on how many others there are.
 _NUMBERS = {"train": range(8000), "val": range(8000, 9000), "test": range(9000, 9500)}
 _FURNITURE_NUMBERS = range(9500, 10000)
@@ -82,6 +85,7 @@ def generate_rooms_v1_furniture(
     output: Path,
     *,
     cads: Path,
+    part: str = "all",
     num_test: int = NUM_TEST,
     processes: int = 0,
     progress: bool = True,
@@ -93,20 +97,26 @@ def generate_rooms_v1_furniture(
 
     Args:
         output: as of ``generate_rooms_v1``; gets a list of test scans only.
-        cads: folder in ShapeNet's layout; all its models are used, and those of the other test rooms where
-            it has fewer than five of what is wanted.
+        cads: folder in ShapeNet's layout; where it has fewer than five models of what is wanted, those of the
+            other test rooms are used, too.
+        part: of its models, ``all``, or ``held_out`` for those that no training room is furnished with. Sets
+            of both parts have scans of the same names, with other furniture in them.
         num_test: scans, numbered from 9500.
         processes: worker processes, 0 for one per core; 1 works in this process.
         progress: show a progress bar.
 
     Raises:
-        ConfigError: the number is too large.
+        ConfigError: the number is too large, or there is no such part.
         DataError: ``output`` holds other rooms, or ``cads`` holds no model that can be used.
     """
+    if part not in FURNITURE_PARTS:
+        raise ConfigError(f"unknown part={part}: choose one of {', '.join(FURNITURE_PARTS)}")
     _check({"test": num_test}, {"test": _FURNITURE_NUMBERS})
     numbers = _FURNITURE_NUMBERS[: max(num_test, _listed(Path(output), "test"))]
-    split = RoomSplit("test", numbers, TEST_FRAMES, _models(2), textures=2, given=None)
+    split = RoomSplit("test", numbers, TEST_FRAMES, _models(2), textures=2, given=FURNITURE_PARTS[part])
     claim = {"format": FORMAT, "furniture": True, **asdict(SETTINGS), "test_frames": TEST_FRAMES}
+    if part != "all":  # rooms made before there were parts go on as they are
+        claim |= {"part": part}
     return make_splits(
         output, SETTINGS, [split], claim=claim, cads=cads, processes=processes, progress=progress
     )

@@ -16,6 +16,7 @@ from raytran.metrics.box_f1 import OrientedBoxF1
 from raytran.metrics.new_views import NewViewScores
 from raytran.metrics.occupancy_iou import ForegroundIoU, SceneOccupancyIoU
 from raytran.metrics.per_scene import Row
+from raytran.metrics.score_calibration import ScoreCalibration
 from raytran.metrics.shape import MatchedShapeScores
 from raytran.metrics.strict import StrictScores, side_by_side
 from raytran.postprocess import DUPLICATE_IOU, SCORE_THRESHOLD, select_objects
@@ -33,7 +34,8 @@ class SceneScores(nn.Module):
         score_threshold: objects with a lower score do not count as predicted.
         duplicate_iou: nor does one that overlaps a surer one of its class by more than this IoU.
         volume_extent: size of the voxel grid, metres; given, the results also tell why objects are missed
-            (``ErrorAtlas``) and how many would be found at other thresholds (``AccuracyCurves``).
+            (``ErrorAtlas``), how many would be found at other thresholds (``AccuracyCurves``), and whether
+            scores mean what they say (``ScoreCalibration``).
         map_boxes: with the mean average precision of boxes that are ``oriented`` or ``axis_aligned``
             (``MeanAveragePrecision``), of predictions of every score; None: without.
         metrics: further ones by name, e.g. of your own: ``update(batch, predictions)`` gets what ``update``
@@ -56,12 +58,16 @@ class SceneScores(nn.Module):
         self._score_threshold = score_threshold
         self._duplicate_iou = duplicate_iou
         self.strict = self.box_f1_of_all = self.mean_average_precision = None
+        self.calibration = self.calibration_of_all = None
         if "objects" in tasks:
             self.strict = StrictScores(
                 explain=volume_extent is not None, volume_extent=volume_extent, classes=classes
             )
             # Predictions of every score, to tell which threshold would have been the best.
             self.box_f1_of_all = OrientedBoxF1(classes=classes)
+            if volume_extent is not None:
+                self.calibration = ScoreCalibration(classes=classes)
+                self.calibration_of_all = ScoreCalibration(classes=classes)
             if map_boxes is not None:
                 self.mean_average_precision = MeanAveragePrecision(boxes=map_boxes, classes=classes)
         self.shape = MatchedShapeScores(classes=classes) if "shape" in tasks else None
@@ -77,6 +83,9 @@ class SceneScores(nn.Module):
             self.strict.update(counted, batch.objects, batch.scene_id, list(batch.grid_center))
             every = self._objects(predictions, 0.0)
             self.box_f1_of_all.update(every, batch.objects, batch.scene_id)
+            if self.calibration is not None and self.calibration_of_all is not None:
+                self.calibration.update(counted, batch.objects, batch.scene_id)
+                self.calibration_of_all.update(every, batch.objects, batch.scene_id)
             if self.mean_average_precision is not None:
                 self.mean_average_precision.update(every, batch.objects, batch.scene_id)
         for index, prediction in enumerate(predictions):
@@ -118,6 +127,11 @@ class SceneScores(nn.Module):
             for threshold, scores in self.box_f1_of_all.compute()["per_threshold"].items():
                 of_threshold = results["strict"]["per_threshold"][threshold]
                 of_threshold |= {name: value for name, value in scores.items() if name in _OF_ALL_SCORES}
+        if self.calibration is not None and self.calibration_of_all is not None:
+            results["strict"]["calibration"] = {
+                "counted": self.calibration.compute(),
+                "every_score": self.calibration_of_all.compute(),
+            }
         if self.mean_average_precision is not None:
             results["map"] = self.mean_average_precision.compute()
         if self.occupancy is not None:
@@ -183,6 +197,8 @@ class SceneScores(nn.Module):
     def reset(self) -> None:
         """Forget all scenes."""
         objects = (self.strict, self.box_f1_of_all, self.mean_average_precision, self.shape)
-        for metric in (*objects, self.occupancy, self.foreground, self.new_views, *self.metrics.values()):
+        calibration = (self.calibration, self.calibration_of_all)
+        others = (self.occupancy, self.foreground, self.new_views, *self.metrics.values())
+        for metric in (*objects, *calibration, *others):
             if metric is not None:
                 metric.reset()

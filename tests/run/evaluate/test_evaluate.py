@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from dataclasses import replace
 
 import pytest
@@ -15,7 +16,7 @@ from torch import nn
 from raytran.classes import PAPER_CLASSES
 from raytran.errors import ConfigError
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.run.evaluate.evaluate import TASKS_WITH_SHAPE, evaluate_model, with_at_most
+from raytran.run.evaluate.evaluate import TASKS_WITH_SHAPE, evaluate_model, first_of, with_at_most
 from raytran.run.evaluate.results import result_tables, write_evaluation
 from raytran.structs import ObjectSet, SceneBatch, ScenePrediction, Views
 
@@ -83,9 +84,15 @@ def test_shapes_of_found_objects_are_compared(tmp_path):
     assert [row["matched"] for row in rows] == ["True", "True", "False"]
     atlas = json.loads((output / "atlas.json").read_text())
     assert [(miss["object"], miss["cause"]) for miss in atlas["misses"]] == [(2, "missed")]
+    calibration = metrics["strict"]["calibration"]
+    assert calibration["counted"]["expected_error"] == pytest.approx((0.1 + 0.2) / 2)
+    assert calibration["every_score"]["expected_error"] == pytest.approx((0.1 + 0.2 + 0.7) / 3)
     console = Console(width=100, record=True)
     console.print(*result_tables(evaluation, title="t"))
-    assert "0.750" in console.export_text()
+    said = console.export_text()
+    assert "0.750" in said
+    assert re.search(r"calibration error +0\.150", said)
+    assert re.search(r"of every score +0\.333", said)
 
 
 def test_nothing_found_is_told_too(tmp_path):
@@ -108,6 +115,12 @@ def test_shapes_are_left_alone_unless_asked_for():
     model = Oracle(replace(batch.objects[0], shape=batch.objects[0].shape.float()))
     assert "shape" not in evaluate_model(model, [batch], progress=False).metrics
     assert model.thresholds == []
+
+
+def test_the_first_scenes_are_taken():
+    scenes = list("abcde")
+    assert [first_of(2, scenes)[index] for index in range(2)] == ["a", "b"]
+    assert first_of(None, scenes) is first_of(9, scenes) is scenes
 
 
 class Counted(list):

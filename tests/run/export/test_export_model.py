@@ -8,16 +8,19 @@ import re
 
 import pytest
 import torch
+from rich.console import Console
 from safetensors import safe_open
 
 import raytran
-from raytran.checkpoints.file import read_checkpoint, write_checkpoint, write_weights
+from raytran.checkpoints.file import file_digest, read_checkpoint, write_checkpoint, write_weights
 from raytran.checkpoints.load import prediction_settings
 from raytran.errors import CheckpointError, ConfigError
 from raytran.export.torch_program import example_inputs
+from raytran.heads.score_scaling import ScoreScaling
 from raytran.run.entry import compose
-from raytran.run.export.export_model import export_model
+from raytran.run.export.export_model import described, export_model
 from raytran.run.plan.camera_paths import walk
+from raytran.structs import Views
 from raytran.training.callbacks.stage import Parent
 
 from ...factories import Trained
@@ -182,3 +185,78 @@ def test_the_decoder_of_shapes_is_a_program_too(trained, tmp_path):
     embedding = torch.randn(1, trained.model.backbone.channels)
     with torch.no_grad():
         torch.testing.assert_close(program(embedding), trained.model.eval().decode_shapes(embedding))
+
+
+def evaluation_of(path, folder, *, scale=0.5, offset=-0.4, **other):
+    """Write what is read of an evaluation, and return its folder."""
+    scaling = None if scale is None else {"scale": scale, "offset": offset}
+    metrics = {"checkpoint_sha256": file_digest(path), "split": "val"}
+    metrics |= {"strict": {"calibration": {"every_score": {"scaling": scaling}}}} | other
+    folder.mkdir(exist_ok=True)
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    return folder
+
+
+def test_scores_are_scaled_in_the_file_and_once_more_from_there(trained, tmp_path, caplog):
+    assert raytran.load(exported(trained, tmp_path)).score_scaling is None
+    results = evaluation_of(trained.path, tmp_path / "results")
+    with caplog.at_level("INFO", "raytran"):
+        once = exported(trained, tmp_path, f"calibration={results}")
+    assert "scaled by 0.500 and shifted by -0.400" in caplog.text
+    model = raytran.load(once)
+    assert model.score_scaling == ScoreScaling(0.5, -0.4)
+    raw = trained.model(walk_of(trained), tasks=("objects",))
+    plain, scaled = (one.decode(raw, ["a"])[0].objects for one in (trained.model, model))
+    assert torch.equal(scaled.score, ScoreScaling(0.5, -0.4)(plain.score))
+    assert torch.equal(scaled.center, plain.center)
+
+    results = evaluation_of(once, tmp_path / "results", scale=2.0, offset=0.1)
+    words = [f"checkpoint={once}", f"output={tmp_path / 'twice.safetensors'}", f"calibration={results}"]
+    twice = export_model(compose("export_model", words))
+    assert raytran.load(twice).score_scaling == ScoreScaling(1.0, 2.0 * -0.4 + 0.1)
+    console = Console(record=True, width=120)
+    console.print(described(read_checkpoint(once), once))
+    assert "log odds × 0.500 -0.400" in console.export_text()
+
+
+def walk_of(trained):
+    cameras = walk(3).scaled_to(prediction_settings(trained.path).image_size)
+    images = torch.zeros(1, 3, 3, *cameras.image_size)
+    return Views(images, cameras.intrinsics[None].float(), cameras.world_from_camera[None].float())
+
+
+def test_evaluations_of_something_else_are_refused(trained, tmp_path, caplog):
+    results = tmp_path / "results"
+    for write, message in (
+        (lambda: None, "says nothing of scores"),
+        (lambda: evaluation_of(trained.path, results, strict={}), "says nothing of scores"),
+        (lambda: evaluation_of(trained.path, results, checkpoint_sha256="0"), "is of another file than"),
+        (lambda: evaluation_of(trained.path, results, scale=None), "do not tell right from wrong"),
+        (lambda: evaluation_of(trained.path, results, scale=-1), "no pair of a scale and an offset"),
+    ):
+        write()
+        with pytest.raises(ConfigError, match=message):
+            exported(trained, tmp_path, f"calibration={results}")
+    assert not (tmp_path / "out").exists()
+    evaluation_of(trained.path, results, split="test")
+    exported(trained, tmp_path, f"calibration={results}")
+    assert "no test any more" in caplog.text
+
+
+@pytest.mark.slow
+def test_what_evaluate_wrote_of_the_shipped_weights_leaves_nothing_to_scale_there(room, tmp_path, command):
+    words = ["data=scan2cad", f"data.root={room}", "split=train", "num_views=4", "stage.targets=[objects]"]
+
+    def calibration(checkpoint, name):
+        done = command("evaluate", f"checkpoint={checkpoint}", *words, f"output={name}", folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+        return json.loads((tmp_path / name / "metrics.json").read_text())["strict"]["calibration"]
+
+    before = calibration("default", "before")
+    scaled = ["checkpoint=default", "output=scaled.safetensors", "calibration=before"]
+    done = command("export_model", *scaled, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    after = calibration("scaled.safetensors", "after")
+    assert before["every_score"]["n_right"] > 0
+    assert before["every_score"]["scaling"] != pytest.approx({"scale": 1.0, "offset": 0.0}, abs=0.1)
+    assert after["every_score"]["scaling"] == pytest.approx({"scale": 1.0, "offset": 0.0}, abs=0.02)

@@ -82,6 +82,9 @@ def test_commands_of_the_documentation_compose(project_root):
         (("dataset=rooms-v1-furniture", "output=x"), "cads= is missing"),
         (("dataset=rooms-v1-furniture", "output=x", "cads=y", "num_val=1"), "has test rooms only"),
         (("dataset=rooms-v1-furniture", "output=x", "cads=y", "min_objects=1"), "leave out min_objects="),
+        (("dataset=rooms-v1-furniture", "output=x", "cads=y", "part=train"), "one of all, held_out"),
+        (("dataset=rooms", "output=x", "part=held_out"), "leave out part="),
+        (("dataset=rooms-v1", "output=x", "part=all"), "leave out part="),
         (
             ("dataset=scannet", "output=x"),
             "choose one of rooms, rooms-v1, rooms-v1-furniture, scan2cad, boxes, arkitscenes, cads",

@@ -8,6 +8,9 @@ from typing import TypedDict
 import torch
 from torch import Tensor
 
+from raytran.geometry.boxes import OrientedBoxes, box_iou
+from raytran.structs import ObjectSet
+
 
 class DetectionScores(TypedDict):
     """Quality of one set of predictions; ratios with nothing to count are 0."""
@@ -24,6 +27,15 @@ class BestScores(DetectionScores):
     """Quality of the predictions with at least a score."""
 
     score_threshold: float
+
+
+def iou_within_class(predictions: ObjectSet, targets: ObjectSet) -> Tensor:
+    """Return the exact IoU of predicted and true boxes, ``(P, M)``; 0 for those of different classes."""
+    iou, _ = box_iou(
+        OrientedBoxes(predictions.center, predictions.size, predictions.rotation),
+        OrientedBoxes(targets.center, targets.size, targets.rotation),
+    )
+    return torch.where(predictions.label[:, None] == targets.label, iou, 0.0)
 
 
 def score_order(score: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from rich.progress import track
 from torch.utils.data import Dataset, Subset
 from torchmetrics import Metric
 
+from raytran.checkpoints.file import checkpoint_path, file_digest
 from raytran.checkpoints.load import PredictionSettings, load_model, prediction_settings
 from raytran.checkpoints.network import trusted_packages
 from raytran.classes import Classes
@@ -118,7 +119,7 @@ def _of_checkpoint(cfg: DictConfig) -> tuple[Evaluation, str]:
     data.prepare_data()
     evaluation = evaluate_model(
         model,
-        with_at_most(cfg.max_objects, data.split(split)),
+        first_of(cfg.max_scenes, with_at_most(cfg.max_objects, data.split(split))),
         tasks=tasks,
         score_threshold=cfg.score_threshold,
         duplicate_iou=cfg.duplicate_iou,
@@ -128,7 +129,8 @@ def _of_checkpoint(cfg: DictConfig) -> tuple[Evaluation, str]:
         metrics=instantiate(cfg.metrics, _convert_="all"),
         map_boxes=cfg.boxes if cfg.protocol == MAP else None,
         about=about_data(data, split, cfg.views.num_views)
-        | {"checkpoint": str(cfg.checkpoint), "max_objects": cfg.max_objects},
+        | {"max_objects": cfg.max_objects, "max_scenes": cfg.max_scenes}
+        | about_network(cfg.checkpoint, model),
     )
     return evaluation, f"{settings.preset}, {split} scenes of {data.root}, {cfg.views.num_views} frames each"
 
@@ -187,6 +189,23 @@ def about_data(data: SceneDataModule, split: str, num_views: int) -> dict[str, A
     return {"dataset": data.name, "data": str(data.root), "split": split, "num_views": num_views}
 
 
+def about_network(checkpoint: str | Path, model: RayTran) -> dict[str, Any]:
+    """Return what ``metrics.json`` says of the network: its file, and how it scales its scores."""
+    scaling = model.score_scaling
+    return {
+        "checkpoint": str(checkpoint),
+        "checkpoint_sha256": file_digest(checkpoint_path(checkpoint)),
+        "score_scaling": None if scaling is None else scaling.settings(),
+    }
+
+
+def first_of(max_scenes: int | None, dataset: Dataset[SceneBatch]) -> Dataset[SceneBatch]:
+    """Return the first so many scenes; all of them for None, or if there are fewer."""
+    if max_scenes is None or max_scenes >= len(dataset):  # type: ignore[arg-type]
+        return dataset
+    return Subset(dataset, range(max_scenes))
+
+
 def with_at_most(max_objects: int | None, dataset: Any) -> Dataset[SceneBatch]:
     """Return the scenes with at most so many objects; all of them for None.
 
@@ -241,7 +260,8 @@ def evaluate_model(
 
     Returns:
         per protocol (``strict``) what ``Scan2CADAccuracy`` and ``OrientedBoxF1`` return, with ``confidence``
-        intervals, the accuracy ``by_scene_size``, the ``curves`` and the error ``atlas``; ``map`` with
+        intervals, the accuracy ``by_scene_size``, the ``curves``, the error ``atlas``, and the
+        ``calibration`` of what counts as predicted (``counted``) and of ``every_score``; ``map`` with
         ``confidence`` intervals if it is asked for; ``occupancy_iou``,
         ``foreground_iou``, under ``shape`` what ``MatchedShapeScores`` returns, under ``new_views`` what
         ``NewViewScores`` does, each of ``metrics`` by its name, and what ``about`` says.

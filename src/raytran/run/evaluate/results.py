@@ -20,6 +20,8 @@ from raytran.limits import POSITION, SHARE, as_numbers
 from raytran.metrics.per_scene import Row
 from raytran.pictures.accuracy_curves import FILE as FIGURE
 from raytran.pictures.accuracy_curves import draw_accuracy_curves
+from raytran.pictures.reliability import FILE as RELIABILITY
+from raytran.pictures.reliability import draw_reliability
 from raytran.run.output import replaced_folder
 
 MARKER = "metrics.json"
@@ -68,7 +70,7 @@ class Evaluation:
 def write_evaluation(
     output: Path, evaluation: Evaluation, *, other_curves: Mapping[str, Curves] | None = None
 ) -> list[str]:
-    """Write ``metrics.json``, the CSV tables, ``atlas.json`` and ``accuracy_curves.png``, all or nothing.
+    """Write ``metrics.json``, the CSV tables, ``atlas.json`` and the figures, all or nothing.
 
     Args:
         output: folder; replaced if it is an earlier result.
@@ -100,6 +102,9 @@ def write_evaluation(
             name = str(metrics.get("predictions", output.name)) if others else output.name
             draw_accuracy_curves(folder / FIGURE, {name: metrics["strict"]["curves"], **others})
             files.append(FIGURE)
+        if "calibration" in metrics.get("strict", {}):
+            draw_reliability(folder / RELIABILITY, metrics["strict"]["calibration"]["counted"])
+            files.append(RELIABILITY)
     return files
 
 
@@ -189,6 +194,11 @@ def _scores_table(metrics: Mapping[str, Any], title: str) -> Table:
             if any(cells):
                 table.add_row(f"{label} @ {threshold}", *cells)
     table.add_section()
+    for label, which in (("calibration error", "counted"), ("the same, of every score", "every_score")):
+        errors = [_calibration_error(scores, which) for scores in by_protocol]
+        if any(errors):
+            table.add_row(label, *errors)
+    table.add_section()
     for task in ("occupancy", "foreground"):
         if f"{task}_iou" in metrics:
             table.add_row(f"IoU of {task}", f"{metrics[f'{task}_iou']:.3f}")
@@ -241,6 +251,11 @@ def _threshold_cell(scores: Mapping[str, Any], threshold: str, number: str) -> s
         return ""
     interval = _interval(scores, f"f1_{threshold}") if number == "f1" else ""
     return f"{entry[number]:.1%} {interval}".rstrip()
+
+
+def _calibration_error(scores: Mapping[str, Any], which: str) -> str:
+    error = scores.get("calibration", {}).get(which, {}).get("expected_error")
+    return "" if error is None else f"{error:.3f}"
 
 
 def _interval(scores: Mapping[str, Any], number: str) -> str:

@@ -13,14 +13,24 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from raytran.checkpoints.file import PREFIX, SUFFIX, checkpoint_path, export_weights, read_checkpoint
+from raytran.checkpoints.file import (
+    PREFIX,
+    SUFFIX,
+    checkpoint_path,
+    export_weights,
+    file_digest,
+    read_checkpoint,
+)
 from raytran.checkpoints.load import classes_of, model_from, prediction_settings
 from raytran.checkpoints.metadata import DataIdentity
 from raytran.checkpoints.network import trusted_packages
 from raytran.classes import Classes
-from raytran.errors import ConfigError
+from raytran.data.text import read_json_object
+from raytran.errors import ConfigError, DataError
 from raytran.export.torch_program import SUFFIX as PROGRAM_SUFFIX
 from raytran.export.torch_program import export_program
+from raytran.heads.score_scaling import ScoreScaling
+from raytran.run.evaluate.results import MARKER
 from raytran.run.plan.camera_paths import walk
 from raytran.run.train.build import plain
 
@@ -37,7 +47,8 @@ def export_model(cfg: DictConfig) -> Path | None:
         The file that was written, None if there was only to say what is in the checkpoint.
 
     Raises:
-        ConfigError: a setting is unknown, or ``output`` is the checkpoint itself or a folder.
+        ConfigError: a setting is unknown, ``output`` is the checkpoint itself or a folder, or ``calibration``
+            is no evaluation of it.
         CheckpointError: the checkpoint is missing or damaged, or the file cannot be written.
     """
     source = checkpoint_path(cfg.checkpoint)
@@ -47,6 +58,8 @@ def export_model(cfg: DictConfig) -> Path | None:
     output = Path(cfg.output)
     _check_output(source, output)
     checkpoint = read_checkpoint(source)
+    if cfg.calibration is not None:
+        checkpoint = calibrated(checkpoint, source, Path(cfg.calibration))
     # What cannot be loaded is not given away.
     model = model_from(checkpoint, source, trust=trusted_packages(cfg.trust))
     if output.suffix == SUFFIX:
@@ -58,6 +71,38 @@ def export_model(cfg: DictConfig) -> Path | None:
         export_program(model, checkpoint, output, cameras=cameras, **plain(cfg.program))
     _log.info("wrote %s: %.1f MB", output.resolve(), output.stat().st_size / 1e6)
     return output
+
+
+def calibrated(checkpoint: Mapping[str, Any], source: Path, evaluation: Path) -> dict[str, Any]:
+    """Return a checkpoint whose scores mean what they say in an evaluation of it, see ``ScoreScaling``.
+
+    Args:
+        checkpoint: what ``read_checkpoint`` returned.
+        source: where from.
+        evaluation: folder that ``raytran.evaluate`` wrote of this very file.
+
+    Raises:
+        ConfigError: there is no such evaluation, it is of another file, or its scores tell nothing.
+    """
+    path = evaluation / MARKER
+    try:
+        metrics = read_json_object(path)
+        of_file, split = metrics["checkpoint_sha256"], metrics["split"]
+        scaling = ScoreScaling.of(metrics["strict"]["calibration"]["every_score"]["scaling"])
+    except (DataError, KeyError, TypeError) as error:
+        raise ConfigError(
+            f"{path} says nothing of scores ({type(error).__name__}): calibration= takes a folder that "
+            "raytran.evaluate wrote for this checkpoint"
+        ) from error
+    if of_file != file_digest(source):
+        raise ConfigError(f"{path} is of another file than {source}: evaluate this one and give its folder")
+    if scaling is None:
+        raise ConfigError(f"the scores in {path} do not tell right from wrong: there is nothing to scale")
+    if split == "test":
+        _log.warning("scores are fitted to test scenes: measured on these they are no test any more")
+    whole = scaling.after(ScoreScaling.of(checkpoint["model"].get("score_scaling")))
+    _log.info("scores are scaled by %.3f and shifted by %+.3f, on log odds", whole.scale, whole.offset)
+    return {**checkpoint, "model": {**checkpoint["model"], "score_scaling": whole.settings()}}
 
 
 def described(checkpoint: Mapping[str, Any], path: Path) -> Table:
@@ -76,6 +121,7 @@ def described(checkpoint: Mapping[str, Any], path: Path) -> Table:
         "parent": f"{parent['stage']}, {parent['step']} steps" if parent else None,
         "trained on": str(known) if (known := DataIdentity.of_checkpoint(checkpoint)) else None,
         "classes": str(classes),
+        "scores": _scaling_of(checkpoint),
         "weights": f"{sum(value.numel() for value in weights) / 1e6:.2f} M, {', '.join(dtypes)}",
         "images": f"{views.get('image_size')}, {views.get('predict_views')} a scene",
         "raytran": versions.get("raytran"),
@@ -95,6 +141,12 @@ def described(checkpoint: Mapping[str, Any], path: Path) -> Table:
         if value is not None:
             table.add_row(escape(name), f"{value:.4g}" if isinstance(value, float) else escape(str(value)))
     return table
+
+
+def _scaling_of(checkpoint: Mapping[str, Any]) -> str | None:
+    """Return how scores are scaled, in words."""
+    scaling = ScoreScaling.of(checkpoint["model"].get("score_scaling"))
+    return None if scaling is None else f"log odds × {scaling.scale:.3f} {scaling.offset:+.3f}"
 
 
 def _is_summary(name: str, classes: Classes) -> bool:

@@ -37,6 +37,8 @@ _FREE_ONLY = ("seed", "frames", "image_size", "min_objects", "max_objects", "roo
 
 _FIXED = "rooms-v1 is the same for everybody; dataset=rooms makes rooms of your choice"
 
+_PART = "it is of the test rooms of dataset=rooms-v1-furniture; training rooms never get what is held out"
+
 
 def prepare(cfg: DictConfig) -> Any:
     """Run ``python -m raytran.prepare``; see ``conf/prepare.yaml``.
@@ -77,6 +79,7 @@ def _data_root(folder: Path) -> str:
 
 def _prepare_rooms(settings: dict[str, Any], output: Path) -> Any:
     _refuse(settings, "num_test", because="dataset=rooms has no test rooms, dataset=rooms-v1 has")
+    _refuse(settings, "part", because=_PART)
     settings = _with_preset(settings)
     report = generate_rooms(
         output,
@@ -91,6 +94,7 @@ def _prepare_rooms(settings: dict[str, Any], output: Path) -> Any:
 def _prepare_rooms_v1(settings: dict[str, Any], output: Path) -> Any:
     _refuse(settings, *_FREE_ONLY, because=_FIXED)
     _refuse(settings, "cads", because="given CAD models go with dataset=rooms-v1-furniture")
+    _refuse(settings, "part", because=_PART)
     report = generate_rooms_v1(output, processes=settings["processes"], **_given(settings, *_COUNTS))
     _log.info("%s\nthe rooms are in %s", report_on_rooms(report.root), report.root)
     _log.info("train on them with data=rooms-v1 %s, then evaluate … split=test", _data_root(output))
@@ -102,9 +106,9 @@ def _prepare_rooms_v1_furniture(settings: dict[str, Any], output: Path) -> Any:
     _refuse(settings, "num_train", "num_val", because="rooms-v1-furniture has test rooms only")
     if settings["cads"] is None:
         raise ConfigError("cads= is missing: give the folder that prepare dataset=cads wrote")
-    numbers = _given(settings, "num_test")
+    chosen = _given(settings, "num_test", "part")
     report = generate_rooms_v1_furniture(
-        output, cads=Path(settings["cads"]), processes=settings["processes"], **numbers
+        output, cads=Path(settings["cads"]), processes=settings["processes"], **chosen
     )
     _log.info("%s\nthe rooms are in %s; evaluate on them with", report_on_rooms(report.root), report.root)
     _log.info("python -m raytran.evaluate checkpoint=CKPT data=scan2cad %s split=test", _data_root(output))
