@@ -70,8 +70,8 @@ def generate_rooms_v1(
     """
     output = Path(output)
     asked = {"train": num_train, "val": num_val, "test": num_test}
-    _check(asked, _NUMBERS)
-    counts = {name: max(count, _listed(output, name)) for name, count in asked.items()}
+    check_numbers(asked, _NUMBERS)
+    counts = {name: max(count, listed_count(output, name)) for name, count in asked.items()}
     splits = (
         RoomSplit("train", _NUMBERS["train"][: counts["train"]], SETTINGS.frames),
         RoomSplit("val", _NUMBERS["val"][: counts["val"]], SETTINGS.frames, _models(1), textures=1),
@@ -111,8 +111,8 @@ def generate_rooms_v1_furniture(
     """
     if part not in FURNITURE_PARTS:
         raise ConfigError(f"unknown part={part}: choose one of {', '.join(FURNITURE_PARTS)}")
-    _check({"test": num_test}, {"test": _FURNITURE_NUMBERS})
-    numbers = _FURNITURE_NUMBERS[: max(num_test, _listed(Path(output), "test"))]
+    check_numbers({"test": num_test}, {"test": _FURNITURE_NUMBERS})
+    numbers = _FURNITURE_NUMBERS[: max(num_test, listed_count(Path(output), "test"))]
     split = RoomSplit("test", numbers, TEST_FRAMES, _models(2), textures=2, given=FURNITURE_PARTS[part])
     claim = {"format": FORMAT, "furniture": True, **asdict(SETTINGS), "test_frames": TEST_FRAMES}
     if part != "all":  # rooms made before there were parts go on as they are
@@ -127,13 +127,18 @@ def _models(split: int) -> range:
     return range(split * MODELS_PER_CLASS, (split + 1) * MODELS_PER_CLASS)
 
 
-def _listed(output: Path, split: str) -> int:
+def listed_count(output: Path, split: str) -> int:
     """Return how many scans of a split were listed by an earlier call."""
     path = output / "scannet" / f"scannetv2_{split}.txt"
     return len(read_split(output / "scannet", split) or ()) if path.is_file() else 0
 
 
-def _check(asked: dict[str, int], numbers: dict[str, range]) -> None:
+def check_numbers(asked: dict[str, int], numbers: dict[str, range]) -> None:
+    """Check numbers of rooms by split.
+
+    Raises:
+        ConfigError: one is too large or negative, or all are 0.
+    """
     for name, count in asked.items():
         if not 0 <= count <= len(numbers[name]):
             raise ConfigError(f"expected 0 to {len(numbers[name])} rooms, got num_{name}={count}")

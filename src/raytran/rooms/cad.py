@@ -93,6 +93,9 @@ OTHER_IDS: dict[str, str] = {
 }
 """ShapeNet's synset of every kind in the class ``other``."""
 
+CLUTTER = "clutter"
+"""Category of models that are of no class: they are seen but not annotated, and are never written."""
+
 
 @dataclass(frozen=True)
 class CadModel:
@@ -101,7 +104,7 @@ class CadModel:
     Attributes:
         catid: ShapeNet's synset.
         model_id: 32 hexadecimal digits that name the geometry and colours.
-        category: one of the paper's classes.
+        category: one of the paper's classes, or ``CLUTTER``.
         kind: kind of furniture, e.g. ``office chair``.
         vertices: ``(V, 3)`` float64.
         faces: ``(F, 3)`` int64, wound outwards; several closed parts that may overlap.
@@ -156,7 +159,7 @@ def finish_model(category: str, design: Design) -> CadModel:
         np.round(vertices, 6).tobytes() + faces.tobytes() + np.round(face_color, 4).tobytes()
     )
     return CadModel(
-        catid=OTHER_IDS[design.kind] if category == "other" else CATID_BY_CLASS[category],
+        catid=OTHER_IDS[design.kind] if category == "other" else CATID_BY_CLASS.get(category, ""),
         model_id=digest.hexdigest()[:32],
         category=category,
         kind=design.kind,

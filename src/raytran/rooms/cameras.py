@@ -39,6 +39,59 @@ _MIN_SHARE = 0.0012
 
 
 @dataclass(frozen=True)
+class Handling:
+    """How a camera is held.
+
+    Attributes:
+        field_of_view: horizontal, radians.
+        heights: least and greatest height, metres.
+        height: mean height, metres.
+        rise: how far it goes up and down, metres.
+        look_down: mean angle below the horizon, radians.
+        nod: how far that angle varies along the walk, radians.
+        roll: how far the camera tilts sideways along the walk, radians.
+        shake: standard deviation of heading and pitch from frame to frame, radians.
+        tremble: that of the roll, radians.
+    """
+
+    field_of_view: float = float(FIELD_OF_VIEW)
+    heights: tuple[float, float] = HEIGHTS
+    height: float = float(np.mean(HEIGHTS))
+    rise: float = 0.22
+    look_down: float = float(LOOK_DOWN)
+    nod: float = float(np.deg2rad(4))
+    roll: float = float(np.deg2rad(2.5))
+    shake: float = float(np.deg2rad(1.5))
+    tremble: float = float(np.deg2rad(0.7))
+
+
+STEADY = Handling()
+"""As ScanNet was scanned."""
+
+
+def draw_handling(rng: np.random.Generator, *, portrait: bool) -> Handling:
+    """Draw how a person holds a telephone: what lens, how high, how far down, how steady.
+
+    The longer side of the picture has a field of view of 45° to 90°; in ``portrait`` that is the upright one.
+    """
+    field = np.deg2rad(45 + 45 * rng.beta(1.6, 2.0)) if not portrait else np.deg2rad(rng.uniform(55, 85))
+    if portrait:
+        field = 2 * np.arctan(0.75 * np.tan(field / 2))
+    height = rng.uniform(1.15, 1.7)
+    return Handling(
+        field_of_view=float(field),
+        heights=(0.9, 1.9),
+        height=float(height),
+        rise=float(rng.uniform(0.05, 0.3)),
+        look_down=float(np.deg2rad(rng.uniform(6, 34))),
+        nod=float(np.deg2rad(rng.uniform(2, 11))),
+        roll=float(np.deg2rad(rng.uniform(0.5, 5))),
+        shake=float(np.deg2rad(rng.uniform(0.5, 3.5))),
+        tremble=float(np.deg2rad(rng.uniform(0.3, 1.5))),
+    )
+
+
+@dataclass(frozen=True)
 class _Survey:
     """Which objects are seen from which positions in which directions.
 
@@ -51,10 +104,18 @@ class _Survey:
     share: NDArray[np.float64]
 
 
-def make_intrinsics(image_size: tuple[int, int], rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw a camera matrix ``(3, 3)`` near that of ScanNet's sensor for pictures of ``image_size`` (H, W)."""
+def make_intrinsics(
+    image_size: tuple[int, int], rng: np.random.Generator, field_of_view: float = float(FIELD_OF_VIEW)
+) -> NDArray[np.float64]:
+    """Draw a camera matrix ``(3, 3)`` near that of a sensor for pictures of ``image_size`` (H, W).
+
+    Args:
+        image_size: ``(H, W)``.
+        rng: source of how it differs from the sensor's.
+        field_of_view: horizontal, radians; that of ScanNet's by default.
+    """
     height, width = image_size
-    focal = width / 2 / np.tan(FIELD_OF_VIEW / 2) * rng.uniform(0.985, 1.015)
+    focal = width / 2 / np.tan(field_of_view / 2) * rng.uniform(0.985, 1.015)
     center = np.array([width, height]) * (0.5 + rng.uniform(-0.006, 0.006, size=2))
     return np.array([[focal, 0.0, center[0]], [0.0, focal, center[1]], [0.0, 0.0, 1.0]]).round(6)
 
@@ -68,6 +129,8 @@ def plan_path(
     image_size: tuple[int, int],
     frames: int,
     rng: np.random.Generator,
+    handling: Handling = STEADY,
+    clutter: Boxes | None = None,
 ) -> tuple[list[Pinhole], NDArray[np.bool_]]:
     """Walk a camera through a furnished room.
 
@@ -79,17 +142,19 @@ def plan_path(
         image_size: ``(H, W)``.
         frames: number of cameras.
         rng: source of all choices.
+        handling: how the camera is held.
+        clutter: boxes of what stands about and is no object.
 
     Returns:
         the cameras in the order of the walk, and ``(M,)`` which objects are seen in too few of them.
     """
-    free = _free_cells(room, boxes)
-    survey = _survey(free, boxes, renderer, rng)
+    free = _free_cells(room, boxes if clutter is None else Boxes.joined([boxes, clutter]))
+    survey = _survey(free, boxes, renderer, rng, handling)
     weight = np.ones(len(boxes))
     best: tuple[list[Pinhole], NDArray[np.bool_]] | None = None
     for _ in range(5):
         stations = _choose_stations(survey, weight, min(max(3, frames // 2), 14), rng)
-        path = _walk(free, survey, stations, frames, rng)
+        path = _walk(free, survey, stations, frames, rng, handling)
         cameras = [Pinhole(intrinsics, pose, image_size) for pose in path]
         missed = _missed(cameras, renderer, len(boxes))
         if best is None or missed.sum() < best[1].sum():
@@ -111,6 +176,8 @@ def _free_cells(room: Room, boxes: Boxes) -> NDArray[np.bool_]:
     x, y = ((np.arange(n) + 0.5) * _CELL for n in shape)
     plan = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
     inside = ((plan > 0.3) & (plan < np.array(room.size[:2]) - 0.3)).all(axis=1)
+    for wall in room.skewed:
+        inside &= (plan - wall.origin) @ wall.inward > 0.3
     best = np.zeros(shape, dtype=bool)
     for lowest, margin in ((0.3, 0.2), (0.8, 0.2), (1.0, CLEARANCE + 0.06)):
         blocked = np.zeros(len(plan), dtype=bool)
@@ -125,14 +192,16 @@ def _free_cells(room: Room, boxes: Boxes) -> NDArray[np.bool_]:
     return best
 
 
-def _survey(free: NDArray[np.bool_], boxes: Boxes, renderer: Renderer, rng: np.random.Generator) -> _Survey:
+def _survey(
+    free: NDArray[np.bool_], boxes: Boxes, renderer: Renderer, rng: np.random.Generator, handling: Handling
+) -> _Survey:
     """Cast a panorama of rays from a sample of free cells and count each object per viewing direction."""
     cells = np.argwhere(free)
     cells = cells[rng.permutation(len(cells))[:80]]
     position = (cells + 0.5) * _CELL
-    eye = np.column_stack([position, np.full(len(cells), np.mean(HEIGHTS))])
+    eye = np.column_stack([position, np.full(len(cells), handling.height)])
     heading = 2 * np.pi * np.arange(_HEADINGS) / _HEADINGS
-    down = LOOK_DOWN + np.deg2rad(45.0) * ((np.arange(_PITCHES) + 0.5) / _PITCHES - 0.5)
+    down = handling.look_down + np.deg2rad(45.0) * ((np.arange(_PITCHES) + 0.5) / _PITCHES - 0.5)
     heading, down = (a.ravel() for a in np.meshgrid(heading, down, indexing="ij"))
     rays = np.stack([np.cos(heading) * np.cos(down), np.sin(heading) * np.cos(down), -np.sin(down)], axis=-1)
     directions = np.ascontiguousarray(np.tile(rays, (len(cells), 1)), dtype=np.float32)
@@ -141,7 +210,7 @@ def _survey(free: NDArray[np.bool_], boxes: Boxes, renderer: Renderer, rng: np.r
     seen = np.bincount(
         number[owner >= 0] * len(boxes) + owner[owner >= 0], minlength=len(cells) * _HEADINGS * len(boxes)
     ).reshape(len(cells), _HEADINGS, len(boxes))
-    width = round(_HEADINGS * FIELD_OF_VIEW / (2 * np.pi))
+    width = round(_HEADINGS * handling.field_of_view / (2 * np.pi))
     window = ndimage.uniform_filter1d(seen.astype(np.float64), width, axis=1, mode="wrap")
     return _Survey(np.asarray(position, dtype=np.float64), window / _PITCHES)
 
@@ -176,6 +245,7 @@ def _walk(
     stations: NDArray[np.int_],
     frames: int,
     rng: np.random.Generator,
+    handling: Handling,
 ) -> list[NDArray[np.float64]]:
     """Join the stations to a walk and return the poses of ``frames`` cameras on it, ``(4, 4)`` each."""
     place = survey.position[stations[:, 0]]
@@ -190,11 +260,11 @@ def _walk(
         leg = min(int(stop), len(legs) - 1)
         share = stop - leg
         spot = _along(legs[leg], share)
-        turn = heading[leg] + (heading[leg + 1] - heading[leg]) * share + rng.normal(0, np.deg2rad(1.5))
-        height = np.mean(HEIGHTS) + 0.22 * np.sin(5 * t + phase[0]) + rng.normal(0, 0.015)
-        down = LOOK_DOWN + np.deg2rad(4) * np.sin(9 * t + phase[1]) + rng.normal(0, np.deg2rad(1.5))
-        roll = np.deg2rad(2.5) * np.sin(7 * t + phase[2]) + rng.normal(0, np.deg2rad(0.7))
-        eye = np.append(spot, np.clip(height, *HEIGHTS))
+        turn = heading[leg] + (heading[leg + 1] - heading[leg]) * share + rng.normal(0, handling.shake)
+        height = handling.height + handling.rise * np.sin(5 * t + phase[0]) + rng.normal(0, 0.015)
+        down = handling.look_down + handling.nod * np.sin(9 * t + phase[1]) + rng.normal(0, handling.shake)
+        roll = handling.roll * np.sin(7 * t + phase[2]) + rng.normal(0, handling.tremble)
+        eye = np.append(spot, np.clip(height, *handling.heights))
         poses.append(pose_from_heading(eye, turn, down, roll))
     return poses
 

@@ -13,6 +13,7 @@ from raytran.data.files import SettingsRecord
 from raytran.data.text import read_names
 from raytran.rooms.benchmark import generate_rooms_v1
 from raytran.rooms.generate import generate_rooms
+from raytran.rooms.rooms_v2 import generate_rooms_v2
 
 _log = logging.getLogger(__name__)
 
@@ -65,10 +66,8 @@ def ensure_rooms_v1(
     """
     output = Path(output)
     asked = (num_train, num_val, num_test)
-    if rooms_are_complete(output, LISTS_V1):
-        present = [len(_scans(output, name)) for name in LISTS_V1]
-        if all(number >= count for number, count in zip(present, asked, strict=True)):
-            return
+    if rooms_are_complete(output, LISTS_V1) and _enough(output, LISTS_V1, asked):
+        return
     count = sum(asked)
     _log.info("making %d rooms in %s (first use; an interrupted set is completed)", count, output.resolve())
     generate_rooms_v1(
@@ -81,6 +80,41 @@ def ensure_rooms_v1(
     )
 
 
+def ensure_rooms_v2(
+    output: Path,
+    *,
+    num_train: int,
+    num_val: int,
+    cads: Path | None = None,
+    processes: int = 0,
+    progress: bool = True,
+) -> None:
+    """Make rooms-v2 in ``output`` unless at least as many rooms are there, which are then used as they are.
+
+    Args:
+        output: the data set.
+        num_train: training rooms.
+        num_val: validation rooms.
+        cads: furniture beside the generated one, see ``generate_rooms_v2``.
+        processes: worker processes, 0 for one per core.
+        progress: show a progress bar.
+
+    Raises:
+        DataError: other rooms are there.
+        ConfigError: a number is too large.
+    """
+    output = Path(output)
+    asked = (num_train, num_val)
+    if rooms_are_complete(output) and _enough(output, LISTS, asked):
+        return
+    _log.info(
+        "making %d rooms in %s (first use; an interrupted set is completed)", sum(asked), output.resolve()
+    )
+    generate_rooms_v2(
+        output, num_train=num_train, num_val=num_val, cads=cads, processes=processes, progress=progress
+    )
+
+
 def rooms_are_complete(output: Path, lists: Sequence[str] = LISTS) -> bool:
     """Say whether ``output`` holds a whole set of rooms: the lists, written last, and every scan in them."""
     if not all((output / name).is_file() for name in ("rooms.json", *(f"scannet/{name}" for name in lists))):
@@ -88,6 +122,11 @@ def rooms_are_complete(output: Path, lists: Sequence[str] = LISTS) -> bool:
     return all(
         (output / "scannet" / "scans" / scan).is_dir() for name in lists for scan in _scans(output, name)
     )
+
+
+def _enough(output: Path, lists: Sequence[str], asked: Sequence[int]) -> bool:
+    """Say whether each list names at least as many scans as asked."""
+    return all(len(_scans(output, name)) >= count for name, count in zip(lists, asked, strict=True))
 
 
 def _scans(output: Path, name: str) -> list[str]:

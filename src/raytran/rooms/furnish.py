@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from raytran.classes import PAPER_CLASSES
 from raytran.rooms.cad import CadModel
@@ -62,11 +63,13 @@ class Furnisher:
         layout: the room being furnished.
         pool: where the models come from.
         wanted: objects to place at most.
+        tucked: share of the chairs at tables that are pushed under them.
     """
 
     layout: Layout
     pool: ModelPool
     wanted: int
+    tucked: float = 0.0
 
     @property
     def room_left(self) -> int:
@@ -76,8 +79,18 @@ class Furnisher:
     def furnish(self) -> None:
         """Place the groups that make the room what it is, then single pieces until the number is reached."""
         _GROUPS[self.layout.room.kind](self)
-        given = {kind: share for kind, share in _GIVEN[self.layout.room.kind].items() if self.pool.has(kind)}
-        weights = _EXTRAS[self.layout.room.kind] | given
+        self.fill_up(_EXTRAS[self.layout.room.kind])
+
+    def fill_up(self, usual: dict[str, float], *, given_share: float = 1.0) -> None:
+        """Place single pieces until the number is reached.
+
+        Args:
+            usual: weight of each piece.
+            given_share: factor of the weights of kinds that only given CAD models have.
+        """
+        kinds = _GIVEN[self.layout.room.kind]
+        given = {kind: given_share * share for kind, share in kinds.items() if self.pool.has(kind)}
+        weights = usual | given
         names, share = list(weights), np.array(list(weights.values())) / sum(weights.values())
         for _ in range(4 * self.wanted):
             if self.room_left <= 0:
@@ -148,7 +161,14 @@ class Furnisher:
         """Put a chair at the front of a table, looking at it."""
         if model is not None:
             front = -self.layout.objects[table].rotation[:2, 2]
-            self.layout.beside(table, model, front / np.linalg.norm(front), along=along, facing="anchor")
+            self.seat_at(table, model, front / np.linalg.norm(front), along)
+
+    def seat_at(self, table: int, model: CadModel, direction: NDArray[np.float64], along: float) -> None:
+        """Put a chair at a side of a table, looking at it, some of them pushed under."""
+        depth = 0.0
+        if self.tucked and self.layout.rng.random() < self.tucked:
+            depth = float(self.layout.rng.uniform(0.2, 0.65)) * float(self.layout.size_of(model)[2])
+        self.layout.beside(table, model, direction, along=along, facing="anchor", tucked=depth)
 
     def table_with_chairs(self, *, most: int) -> None:
         """A table in the middle of the room with chairs on its sides, most often all alike."""
@@ -167,6 +187,11 @@ class Furnisher:
                 break
         if table is None:
             return
+        self.seats_round(table, most=most)
+
+    def seats_round(self, table: int, *, most: int) -> None:
+        """Put chairs on the sides of a table, most often all alike."""
+        rng = self.layout.rng
         chair = self.draw("chair", *_TABLE_CHAIRS)
         alike = rng.random() < 0.75
         for direction, along in self._seats(table)[:most]:
@@ -174,7 +199,7 @@ class Furnisher:
                 continue
             seat = chair if alike else self.draw("chair", *_TABLE_CHAIRS)
             if seat is not None and self.room_left > 0:
-                layout.beside(table, seat, direction, along=along, facing="anchor")
+                self.seat_at(table, seat, direction, along)
 
     def _seats(self, table: int) -> list[tuple[np.ndarray, float]]:
         """Return places round a table as (outward direction, shift along the side), in random order."""

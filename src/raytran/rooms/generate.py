@@ -30,7 +30,7 @@ from raytran.rooms.library import (
     survey,
     write_library,
 )
-from raytran.rooms.scene import RoomSettings, make_scene
+from raytran.rooms.scene import Look, RoomSettings, make_scene
 from raytran.rooms.write import annotation_path, write_scene
 
 _log = logging.getLogger(__name__)
@@ -56,14 +56,18 @@ class RoomSplit:
         models: numbers of the generated models of each class that its rooms use.
         textures: number of the set of textures that its rooms are painted with.
         given: split of the given CAD models that its rooms use, ``train`` or ``val``; None for all.
+        mixed: draw as often from the generated models as from the given ones.
+        look: how its rooms are and are recorded, see ``make_scene``.
     """
 
     name: str
     numbers: range
     frames: int
-    models: range = range(MODELS_PER_CLASS)
+    models: Sequence[int] = range(MODELS_PER_CLASS)
     textures: int = 0
     given: str | None = "train"
+    mixed: bool = False
+    look: Look = "plain"
 
     @property
     def scan_ids(self) -> tuple[str, ...]:
@@ -213,8 +217,9 @@ def _make_scan(output: Path, settings: RoomSettings, cads: Path | None, which: t
     split, number = which
     rng = np.random.default_rng([settings.seed, number])
     library = None if cads is None else read_library(output / _CADS, cads)
-    pool = ModelPool(settings.seed, library, split.given, split.models)
-    scene = make_scene(replace(settings, frames=split.frames), rng, pool, textures=split.textures)
+    pool = ModelPool(settings.seed, library, split.given, split.models, mixed=split.mixed)
+    settings = replace(settings, frames=split.frames)
+    scene = make_scene(settings, rng, pool, textures=split.textures, look=split.look)
     return write_scene(scene, scan_id=scan_name(number), root=output, rng=rng)
 
 

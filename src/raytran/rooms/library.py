@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from pathlib import Path
@@ -242,7 +242,7 @@ def _size_of(facts: dict[str, Any]) -> np.ndarray | None:
         return None
 
 
-@lru_cache(maxsize=128)
+@lru_cache(maxsize=256)
 def _load(root: Path, model: LibraryModel) -> CadModel:
     mesh = read_mesh(root, model.catid, model.model_id)
     group, colors = read_face_colors(mesh_path(root, model.catid, model.model_id), len(mesh.faces))
@@ -271,12 +271,14 @@ class ModelPool:
         library: CAD models given; None for generated ones alone.
         split: whose models of the library are drawn, ``train`` or ``val``; None for all.
         numbers: of the generated models of each class.
+        mixed: draw as often from the generated models as from the library; else from these only to fill up.
     """
 
     seed: int
     library: CadLibrary | None = None
     split: str | None = "train"
-    numbers: range = range(MODELS_PER_CLASS)
+    numbers: Sequence[int] = range(MODELS_PER_CLASS)
+    mixed: bool = False
 
     def draw(
         self, category: str, rng: np.random.Generator, *, kinds: Collection[str] = ()
@@ -296,11 +298,12 @@ class ModelPool:
             generated = category != "other" or not kinds or any(kind in OTHER_IDS for kind in kinds)
             if not (given or generated):
                 return None
-            number = int(rng.integers(max(len(given), FEW if generated else 0)))
+            filled = 2 * len(given) if self.mixed and generated else max(len(given), FEW if generated else 0)
+            number = int(rng.integers(max(filled, 1)))
             if number < len(given):
                 return self.library.load(given[number])
-        for number in rng.integers(self.numbers.start, self.numbers.stop, size=60):
-            model = _generated(self.seed, category, int(number))
+        for position in rng.integers(len(self.numbers), size=60):
+            model = _generated(self.seed, category, self.numbers[position])
             if not kinds or model.kind in kinds:
                 return model
         return None

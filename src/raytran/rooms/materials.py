@@ -50,12 +50,18 @@ class Paint:
         light: display RGB in [0, 1] where the texture is 1.
         texture: index into ``materials.TEXTURES``.
         emissive: the surface shines and takes no light.
+        scale: the texture repeats after its side times this.
+        turned: the texture's two axes are exchanged, as where a board lies across.
+        shift: where the texture begins, in its sides.
     """
 
     dark: tuple[float, float, float]
     light: tuple[float, float, float]
     texture: int = 0
     emissive: bool = False
+    scale: float = 1.0
+    turned: bool = False
+    shift: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -69,6 +75,7 @@ class Surfaces:
         texture: ``(T,)`` int32.
         emissive: ``(T,)`` bool.
         owner: ``(T,)`` int32 number of the object, or ``ROOM_OWNER``.
+        mapping: ``(T, 4)`` float32: scale, turned and shift of the ``Paint``.
     """
 
     triangles: NDArray[np.float32]
@@ -77,6 +84,7 @@ class Surfaces:
     texture: NDArray[np.int32]
     emissive: NDArray[np.bool_]
     owner: NDArray[np.int32]
+    mapping: NDArray[np.float32]
 
     @staticmethod
     def painted(triangles: NDArray[np.floating], paint: Paint, owner: int = ROOM_OWNER) -> Surfaces:
@@ -89,6 +97,9 @@ class Surfaces:
             texture=np.full(count, paint.texture, dtype=np.int32),
             emissive=np.full(count, paint.emissive),
             owner=np.full(count, owner, dtype=np.int32),
+            mapping=np.tile(
+                np.array([paint.scale, paint.turned, *paint.shift], dtype=np.float32), (count, 1)
+            ),
         )
 
     @staticmethod
@@ -101,6 +112,7 @@ class Surfaces:
             texture=np.concatenate([surfaces.texture for surfaces in sets]),
             emissive=np.concatenate([surfaces.emissive for surfaces in sets]),
             owner=np.concatenate([surfaces.owner for surfaces in sets]),
+            mapping=np.concatenate([surfaces.mapping for surfaces in sets]),
         )
 
 
@@ -156,8 +168,16 @@ class TextureLibrary:
         level = np.frexp(footprint * density)[1].clip(0, LEVELS - 1)
         column = np.floor(u * density).astype(np.int32) & (SIZE - 1)
         row = np.floor(v * density).astype(np.int32) & (SIZE - 1)
-        start = texture * _LEVEL_START[-1] + _LEVEL_START[level]
-        return self.texels[start + ((row >> level) << (LEVELS - 1 - level)) + (column >> level)]
+        return self.texels[texel_index(texture, level, row, column)]
+
+
+def texel_index(
+    texture: NDArray[np.int32], level: NDArray[np.int32], row: NDArray[np.int32], column: NDArray[np.int32]
+) -> NDArray[np.int32]:
+    """Return where the texels ``(n,)`` lie in an array of all levels of all textures, one after another."""
+    start = texture * _LEVEL_START[-1] + _LEVEL_START[level]
+    index: NDArray[np.int32] = start + ((row >> level) << (LEVELS - 1 - level)) + (column >> level)
+    return index
 
 
 _LEVEL_START = np.concatenate([[0], np.cumsum([(SIZE >> level) ** 2 for level in range(LEVELS)])]).astype(
@@ -194,14 +214,15 @@ def value_noise(rng: np.random.Generator, cells: tuple[int, int]) -> NDArray[np.
     return result
 
 
-def _cloud(rng: np.random.Generator, cells: int, octaves: int) -> NDArray[np.float64]:
+def cloud(rng: np.random.Generator, cells: int, octaves: int) -> NDArray[np.float64]:
+    """Return ``(SIZE, SIZE)`` noise of several octaves, each half as strong as the one before."""
     parts = [value_noise(rng, (cells << i, cells << i)) * 0.5**i for i in range(octaves)]
     return sum(parts, np.zeros(())) / (2 - 0.5 ** (octaves - 1))
 
 
-def _grain(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Wood grain: noise stretched along u, bent by a slow cloud."""
-    bent = _cloud(rng, 3, 2) * 10 + value_noise(rng, (64, 2)) * 1.5
+def grain(rng: np.random.Generator) -> NDArray[np.float64]:
+    """Return ``(SIZE, SIZE)`` wood grain: noise stretched along u, bent by a slow cloud."""
+    bent = cloud(rng, 3, 2) * 10 + value_noise(rng, (64, 2)) * 1.5
     return (
         0.5
         + 0.3 * np.sin(2 * np.pi * bent) * value_noise(rng, (16, 4))
@@ -209,10 +230,10 @@ def _grain(rng: np.random.Generator) -> NDArray[np.float64]:
     )
 
 
-def _blocks(
+def blocks(
     rng: np.random.Generator, rows: int, columns: int, shift: float, gap: float
 ) -> NDArray[np.float64]:
-    """Staggered blocks of differing grey with dark joints of ``gap`` (share of a row's height)."""
+    """Return ``(SIZE, SIZE)``: staggered blocks of differing grey, joints of ``gap`` of a row's height dark."""
     v, u = np.meshgrid(np.arange(SIZE) * rows / SIZE, np.arange(SIZE) * columns / SIZE, indexing="ij")
     row = v.astype(int)
     u = u + row * shift
@@ -223,27 +244,27 @@ def _blocks(
 
 def _draw(name: str, rng: np.random.Generator) -> NDArray[np.float64]:
     if name == "plaster":
-        return 0.7 * _cloud(rng, 8, 4) + 0.3 * rng.random((SIZE, SIZE))
+        return 0.7 * cloud(rng, 8, 4) + 0.3 * rng.random((SIZE, SIZE))
     if name == "stripes":
         wave = (np.arange(SIZE) * 8 // SIZE) % 2
-        return 0.15 + 0.7 * np.tile(wave, (SIZE, 1)) + 0.15 * _cloud(rng, 16, 2)
+        return 0.15 + 0.7 * np.tile(wave, (SIZE, 1)) + 0.15 * cloud(rng, 16, 2)
     if name == "planks":
-        return 0.6 * _blocks(rng, 16, 2, 0.5, 0.04) + 0.5 * _grain(rng) - 0.1
+        return 0.6 * blocks(rng, 16, 2, 0.5, 0.04) + 0.5 * grain(rng) - 0.1
     if name == "parquet":
-        return 0.6 * _blocks(rng, 16, 4, 0.5, 0.05) + 0.4 * _grain(rng)
+        return 0.6 * blocks(rng, 16, 4, 0.5, 0.05) + 0.4 * grain(rng)
     if name == "tiles":
-        return 0.75 * _blocks(rng, 4, 4, 0.0, 0.03) ** 0.4 + 0.25 * _cloud(rng, 8, 4)
+        return 0.75 * blocks(rng, 4, 4, 0.0, 0.03) ** 0.4 + 0.25 * cloud(rng, 8, 4)
     if name == "carpet":
-        return 0.5 * rng.random((SIZE, SIZE)) + 0.5 * _cloud(rng, 16, 4)
+        return 0.5 * rng.random((SIZE, SIZE)) + 0.5 * cloud(rng, 16, 4)
     if name == "wood":
-        return _grain(rng)
+        return grain(rng)
     if name == "fabric":
         weave = np.sin(np.arange(SIZE) * 2 * np.pi * 64 / SIZE)
-        return 0.5 + 0.2 * weave[:, None] * weave[None, :] + 0.4 * (_cloud(rng, 16, 3) - 0.5)
+        return 0.5 + 0.2 * weave[:, None] * weave[None, :] + 0.4 * (cloud(rng, 16, 3) - 0.5)
     if name == "sky":
-        return 0.6 + 0.8 * (_cloud(rng, 3, 4) - 0.5)
+        return 0.6 + 0.8 * (cloud(rng, 3, 4) - 0.5)
     if name == "picture":
-        return np.floor(_cloud(rng, 4, 3) * 6) / 5
+        return np.floor(cloud(rng, 4, 3) * 6) / 5
     return np.ones((SIZE, SIZE))
 
 

@@ -21,6 +21,7 @@ from raytran.rooms.materials import (
     tinted,
     wall_paint,
 )
+from raytran.rooms.objects import Boxes
 
 _WHITE = Paint(dark=(0.86, 0.86, 0.85), light=(0.93, 0.93, 0.92))
 
@@ -51,6 +52,24 @@ class Wall:
         """Return the two opposite corners ``(2, 3)`` of a box given by its ranges in wall coordinates."""
         ends = np.stack([self.point(s[0], d[0], z[0]), self.point(s[1], d[1], z[1])])
         return np.stack([ends.min(axis=0), ends.max(axis=0)])
+
+    def oriented(self, s: tuple[float, float], d: tuple[float, float], z: tuple[float, float]) -> Boxes:
+        """Return the box of these ranges in wall coordinates, turned as the wall is."""
+        if np.abs(self.along).max() == 1.0:
+            return Boxes.aligned(self.box(s, d, z)[None])
+        axes = np.zeros((3, 3))
+        axes[:2, 0], axes[:2, 1], axes[2, 2] = self.along, self.inward, 1.0
+        ranges = np.array([s, d, z])
+        middle = ranges.mean(axis=1)
+        return Boxes(self.point(*middle)[None], axes[None], np.ptp(ranges, axis=1)[None] / 2)
+
+    def solid(
+        self, s: tuple[float, float], d: tuple[float, float], z: tuple[float, float]
+    ) -> NDArray[np.float64]:
+        """Return the triangles ``(12, 3, 3)`` of the box of these ranges in wall coordinates."""
+        local = box_triangles((s[0], d[0], z[0]), (s[1], d[1], z[1]))
+        plan = self.origin + local[..., :1] * self.along + local[..., 1:2] * self.inward
+        return np.concatenate([plan, local[..., 2:]], axis=-1)
 
 
 @dataclass(frozen=True)
@@ -90,6 +109,25 @@ class Light:
 
 
 @dataclass(frozen=True)
+class Sun:
+    """Sunlight through a window.
+
+    Attributes:
+        toward: ``(3,)`` unit vector to the sun.
+        color: ``(3,)`` linear RGB of its light.
+        wall: the wall with the window.
+        s: range of the window along the wall, metres.
+        z: range of its heights, metres.
+    """
+
+    toward: NDArray[np.float64]
+    color: NDArray[np.float64]
+    wall: Wall
+    s: tuple[float, float]
+    z: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class Room:
     """An empty room.
 
@@ -100,6 +138,9 @@ class Room:
         openings: doors and windows.
         lights: lamps and daylight.
         surfaces: what is seen of the room.
+        built_in: what stands in it and belongs to it, such as columns; no furniture may be there.
+        sun: sunlight that falls in.
+        ambient: ``(3,)`` linear RGB of light from everywhere.
     """
 
     kind: str
@@ -108,14 +149,30 @@ class Room:
     openings: tuple[Opening, ...]
     lights: tuple[Light, ...]
     surfaces: Surfaces
+    built_in: Boxes | None = None
+    sun: Sun | None = None
+    ambient: tuple[float, float, float] = (0.28, 0.28, 0.28)
 
-    def keep_free(self) -> NDArray[np.float64]:
-        """Return boxes ``(n, 2, 3)`` (lower, upper) where no furniture may stand: at doors and windows."""
+    def keep_free(self) -> Boxes:
+        """Return boxes where no furniture may stand: at doors and windows, and what is built in."""
         boxes = []
         for opening in self.openings:
             depth = 0.85 if opening.kind == "door" else 0.12
-            boxes.append(self.walls[opening.wall].box(opening.s, (0.0, depth), opening.z))
-        return np.stack(boxes)
+            boxes.append(self.walls[opening.wall].oriented(opening.s, (0.0, depth), opening.z))
+        if self.built_in is not None:
+            boxes.append(self.built_in)
+        return Boxes.joined(boxes) if boxes else Boxes.aligned(np.zeros((0, 2, 3)))
+
+    def holds(self, corners: NDArray[np.float64]) -> bool:
+        """Say whether points ``(n, 3)`` all lie in the room, 2 cm from walls and ceiling at least."""
+        if (corners[:, :2] < 0.02).any() or (corners > np.array(self.size) - 0.02).any():
+            return False
+        return all(((corners[:, :2] - wall.origin) @ wall.inward >= 0.02).all() for wall in self.skewed)
+
+    @property
+    def skewed(self) -> list[Wall]:
+        """The walls that are not parallel to an axis."""
+        return [wall for wall in self.walls if np.abs(wall.along).max() < 1.0]
 
 
 def make_room(kind: str, size: tuple[float, float, float], rng: np.random.Generator) -> Room:

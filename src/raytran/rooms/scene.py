@@ -4,21 +4,30 @@
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from raytran.errors import ConfigError
-from raytran.rooms.cameras import make_intrinsics, plan_path
+from raytran.rooms import busy
+from raytran.rooms.building import build_room
+from raytran.rooms.cameras import draw_handling, make_intrinsics, plan_path
+from raytran.rooms.film import Film, draw_film, tracked_poses
+from raytran.rooms.finishes import clutter_finish, object_finish
 from raytran.rooms.furnish import ROOM_KINDS, Furnisher
 from raytran.rooms.layout import Layout
 from raytran.rooms.library import ModelPool
-from raytran.rooms.materials import Paint, Surfaces, texture_index, texture_library
+from raytran.rooms.materials import ROOM_OWNER, Paint, Surfaces, texture_index, texture_library
 from raytran.rooms.objects import FLOOR, Boxes, PlacedObject
 from raytran.rooms.render import Pinhole, Renderer
 from raytran.rooms.room import Room, make_room
+from raytran.rooms.textures import photo_textures
+
+Look = Literal["plain", "world"]
+"""How rooms are: see ``make_scene``."""
 
 _ATTEMPTS = 40
 
@@ -54,6 +63,9 @@ class Scene:
         cameras: the walk, in the room's frame.
         renderer: draws the room.
         scan_from_room: ``(4, 4)`` pose of the room in its scan, whose axes are not those of the room.
+        film: what makes pictures of light; None where the renderer's exposure does.
+        tracked: ``(n, 4, 4)`` what tracking found of the cameras' poses; None where that is what they are.
+        calibrated: ``(3, 3)`` what calibration found of the intrinsics; None where that is what they are.
     """
 
     room: Room
@@ -61,10 +73,18 @@ class Scene:
     cameras: tuple[Pinhole, ...]
     renderer: Renderer
     scan_from_room: NDArray[np.float64]
+    film: Film | None = None
+    tracked: NDArray[np.float64] | None = None
+    calibrated: NDArray[np.float64] | None = None
 
 
 def make_scene(
-    settings: RoomSettings, rng: np.random.Generator, pool: ModelPool | None = None, *, textures: int = 0
+    settings: RoomSettings,
+    rng: np.random.Generator,
+    pool: ModelPool | None = None,
+    *,
+    textures: int = 0,
+    look: Look = "plain",
 ) -> Scene:
     """Draw a scene in which every object is seen in several frames.
 
@@ -73,16 +93,19 @@ def make_scene(
         rng: source of all choices.
         pool: where the furniture comes from; None for generated models.
         textures: which draw of the textures is used.
+        look: ``"plain"``: tidy rooms without clutter, seen by a steady camera in even light; ``"world"``:
+            rooms as people leave them, recorded with a telephone.
 
     Raises:
         ConfigError: no such scene was found, as when many objects are asked of a tiny room.
     """
     pool = pool or ModelPool(settings.seed)
     for _ in range(_ATTEMPTS):
-        layout = _furnish(settings, pool, rng)
+        layout = _furnish(settings, pool, rng) if look == "plain" else _furnish_busily(settings, pool, rng)
         if len(layout.objects) < settings.min_objects:
             continue
-        scene = _record(settings, layout, rng, textures)
+        record = _record if look == "plain" else _film
+        scene = record(settings, layout, rng, textures)
         if scene is not None:
             return scene
     (a, b), (c, d) = settings.room_size
@@ -119,19 +142,122 @@ def _record(settings: RoomSettings, layout: Layout, rng: np.random.Generator, te
         frames=settings.frames,
         rng=rng,
     )
+    objects = tuple(layout.objects)
     if missed.any():
         remaining = _without(layout.objects, missed)
         if len(remaining) < settings.min_objects:
             return None
-        objects = tuple(
-            replace(layout.objects[i], parent=_new_number(remaining, layout.objects[i].parent))
-            for i in remaining
-        )
+        objects = _renumbered(layout.objects, remaining)
         renderer = _make_renderer(layout.room, objects, [paints[i] for i in remaining], textures)
-    else:
-        objects = tuple(layout.objects)
     renderer.expose(cameras[:: max(1, len(cameras) // 6)], brightness=rng.uniform(0.35, 0.55))
     return Scene(layout.room, objects, tuple(cameras), renderer, _draw_scan_frame(layout.room, rng))
+
+
+def _furnish_busily(settings: RoomSettings, pool: ModelPool, rng: np.random.Generator) -> Layout:
+    """Furnish a room as people do, and strew clutter."""
+    kind = str(rng.choice(list(busy.ROOM_KINDS), p=list(busy.ROOM_KINDS.values())))
+    most = 0.3 if kind == "bathroom" else 1.0
+    # Large rooms are rarer than small ones.
+    x, y = (low + most * (high - low) * rng.beta(1.4, 2.2) for low, high in settings.room_size)
+    size = (x, y, float(rng.choice([rng.uniform(2.2, 2.45), rng.uniform(2.4, 2.9), rng.uniform(2.9, 3.6)])))
+    usual = settings.min_objects + (0.25 + rng.gamma(2.0, 0.28)) * (x * y - 4)
+    wanted = int(np.clip(usual * rng.uniform(0.4, 1.0), settings.min_objects, settings.max_objects))
+    layout = Layout(room=build_room(kind, size, rng), rng=rng, stretch=0.15)
+    furnisher = busy.BusyFurnisher(layout=layout, pool=pool, wanted=wanted)
+    furnisher.furnish()
+    furnisher.strew(float(rng.choice([0.2, 0.7, 1.3, 2.2], p=[0.2, 0.35, 0.3, 0.15])))
+    return layout
+
+
+def _film(settings: RoomSettings, layout: Layout, rng: np.random.Generator, textures: int) -> Scene | None:
+    """Walk through the room with a telephone; None if too few objects are seen."""
+    portrait = rng.random() < 0.2
+    image_size = settings.image_size[::-1] if portrait else settings.image_size
+    handling = draw_handling(rng, portrait=portrait)
+    paints = _alike(layout.objects, object_finish, rng)
+    littered = [clutter_finish(placed, rng) for placed in layout.clutter]
+    standing = Boxes.joined([placed.box for placed in layout.clutter] + [layout.room.keep_free()])
+    renderer = _photographic(layout.room, layout.objects, paints, layout.clutter, littered, textures)
+    cameras, missed = plan_path(
+        room=layout.room,
+        boxes=Boxes.joined([placed.box for placed in layout.objects]),
+        renderer=renderer,
+        intrinsics=make_intrinsics(image_size, rng, handling.field_of_view),
+        image_size=image_size,
+        frames=settings.frames,
+        rng=rng,
+        handling=handling,
+        clutter=standing,
+    )
+    objects = tuple(layout.objects)
+    if missed.any():
+        remaining = _without(layout.objects, missed)
+        if len(remaining) < settings.min_objects:
+            return None
+        objects = _renumbered(layout.objects, remaining)
+        kept = [i for i, placed in enumerate(layout.clutter) if placed.parent in (FLOOR, *remaining)]
+        renderer = _photographic(
+            layout.room,
+            objects,
+            [paints[i] for i in remaining],
+            [layout.clutter[i] for i in kept],
+            [littered[i] for i in kept],
+            textures,
+        )
+    poses = np.stack([camera.room_from_camera for camera in cameras])
+    calibrated = cameras[0].intrinsics.copy()
+    calibrated[:2] *= 1 + rng.normal(0, 0.007)
+    calibrated[:2, 2] = cameras[0].intrinsics[:2, 2] + rng.normal(0, 0.004, size=2) * image_size[::-1]
+    return Scene(
+        room=layout.room,
+        objects=objects,
+        cameras=tuple(cameras),
+        renderer=renderer,
+        scan_from_room=_draw_scan_frame(layout.room, rng),
+        film=draw_film(rng),
+        tracked=tracked_poses(poses, rng),
+        calibrated=calibrated.round(6),
+    )
+
+
+def _alike(
+    objects: Sequence[PlacedObject],
+    paint: Callable[[PlacedObject, np.random.Generator], list[Paint]],
+    rng: np.random.Generator,
+) -> list[list[Paint]]:
+    """Paint objects, those of one model alike."""
+    known: dict[str, list[Paint]] = {}
+    paints = []
+    for placed in objects:
+        if placed.model.model_id not in known:
+            known[placed.model.model_id] = paint(placed, rng)
+        paints.append(known[placed.model.model_id])
+    return paints
+
+
+def _photographic(
+    room: Room,
+    objects: Sequence[PlacedObject],
+    paints: list[list[Paint]],
+    clutter: Sequence[PlacedObject],
+    littered: list[list[Paint]],
+    textures: int,
+) -> Renderer:
+    owners = [*range(len(objects)), *([ROOM_OWNER] * len(clutter))]
+    surfaces = _painted([*objects, *clutter], [*paints, *littered], owners)
+    return Renderer(
+        surfaces=Surfaces.joined([room.surfaces, *surfaces]),
+        lights=room.lights,
+        textures=photo_textures(textures),
+        photographic=True,
+        ambient=room.ambient,
+        sun=room.sun,
+    )
+
+
+def _renumbered(objects: list[PlacedObject], remaining: list[int]) -> tuple[PlacedObject, ...]:
+    """Return the objects that remain, with the new numbers of their parents."""
+    return tuple(replace(objects[i], parent=_new_number(remaining, objects[i].parent)) for i in remaining)
 
 
 def _without(objects: list[PlacedObject], missed: NDArray[np.bool_]) -> list[int]:
@@ -163,11 +289,19 @@ def _draw_scan_frame(room: Room, rng: np.random.Generator) -> NDArray[np.float64
 def _make_renderer(
     room: Room, objects: Sequence[PlacedObject], paints: list[list[Paint]], textures: int
 ) -> Renderer:
-    parts = [room.surfaces]
-    for number, (placed, paint) in enumerate(zip(objects, paints, strict=True)):
-        triangles, group = placed.triangles(), placed.model.face_group
-        parts += [Surfaces.painted(triangles[group == i], paint[i], owner=number) for i in range(len(paint))]
+    parts = [room.surfaces, *_painted(objects, paints, range(len(objects)))]
     return Renderer(surfaces=Surfaces.joined(parts), lights=room.lights, textures=texture_library(textures))
+
+
+def _painted(
+    objects: Sequence[PlacedObject], paints: list[list[Paint]], owners: Sequence[int]
+) -> list[Surfaces]:
+    """Return the surfaces of objects, each with a paint for each of its materials."""
+    parts = []
+    for owner, placed, paint in zip(owners, objects, paints, strict=True):
+        triangles, group = placed.triangles(), placed.model.face_group
+        parts += [Surfaces.painted(triangles[group == i], paint[i], owner=owner) for i in range(len(paint))]
+    return parts
 
 
 def _paint_object(placed: PlacedObject, rng: np.random.Generator) -> list[Paint]:

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from raytran.data.files import finished_folder, write_text
 from raytran.data.shapenet.models import copy_model
+from raytran.rooms.film import BRIGHTEST, Film, moved_blur
 from raytran.rooms.objects import PlacedObject
 from raytran.rooms.scene import Scene
 from raytran.rooms.shapenet_files import write_model
@@ -48,7 +49,10 @@ def write_scene(scene: Scene, *, scan_id: str, root: Path, rng: np.random.Genera
     with finished_folder(scans / scan_id) as folder:
         for name in ("color", "pose", "intrinsic"):
             (folder / name).mkdir()
-        count = _write_frames(scene, folder, rng)
+        if scene.film is None:
+            count = _write_frames(scene, folder, rng)
+        else:
+            count = _write_film(scene, scene.film, folder, rng)
         _write_scan_facts(scene, folder, scan_id, count)
     return len(scene.objects)
 
@@ -125,8 +129,42 @@ def _write_frames(scene: Scene, folder: Path, rng: np.random.Generator) -> int:
     return number // FRAME_STEP
 
 
-def _write_frame(folder: Path, number: int, picture: Image.Image, pose: NDArray[np.float64]) -> None:
-    picture.save(folder / "color" / f"{number}.jpg", quality=_JPEG_QUALITY)
+def _write_film(scene: Scene, film: Film, folder: Path, rng: np.random.Generator) -> int:
+    """Write pictures as a telephone takes them and poses as it tracks them; return how many frames there are.
+
+    Where tracking is lost the picture is blurred most.
+    """
+    count = len(scene.cameras)
+    lost_after = set(rng.choice(count, size=int(rng.integers(0, min(4, count + 1))), replace=False))
+    tracked = scene.tracked if scene.tracked is not None else [c.room_from_camera for c in scene.cameras]
+    light = [scene.renderer.radiance(camera, BRIGHTEST) for camera in scene.cameras]
+    usual = float(np.mean([np.minimum(each[:, ::4, ::4], 2.0).mean() for each in light]))
+    turns = np.gradient(np.stack([camera.room_from_camera[:2, 2] for camera in scene.cameras]), axis=0)
+    number = 0
+    for index, pose in enumerate(tracked):
+        motion = np.array([np.linalg.norm(turns[index]), 0.0]) + rng.normal(0, 0.15, size=2)
+        picture = Image.fromarray(film.develop(light[index], usual, motion, rng))
+        quality = int(rng.integers(film.quality[0], film.quality[1] + 1))
+        _write_frame(folder, number, picture, scene.scan_from_room @ pose, quality=quality)
+        number += FRAME_STEP
+        if index in lost_after:
+            blurred = Image.fromarray(
+                film.develop(moved_blur(light[index], motion, 12.0), usual, motion, rng)
+            )
+            _write_frame(folder, number, blurred, np.full((4, 4), -np.inf), quality=quality)
+            number += FRAME_STEP
+    return number // FRAME_STEP
+
+
+def _write_frame(
+    folder: Path,
+    number: int,
+    picture: Image.Image,
+    pose: NDArray[np.float64],
+    *,
+    quality: int = _JPEG_QUALITY,
+) -> None:
+    picture.save(folder / "color" / f"{number}.jpg", quality=quality)
     (folder / "pose" / f"{number}.txt").write_text(_matrix_text(pose), encoding="ascii")
 
 
@@ -138,8 +176,9 @@ def _write_scan_facts(scene: Scene, folder: Path, scan_id: str, count: int) -> N
     """Write the intrinsics and ``<scan>.txt``, whose ``axisAlignment`` sets the room straight."""
     camera = scene.cameras[0]
     height, width = camera.image_size
+    known = camera.intrinsics if scene.calibrated is None else scene.calibrated
     intrinsics = np.eye(4)
-    intrinsics[:3, :3] = camera.intrinsics
+    intrinsics[:3, :3] = known
     (folder / "intrinsic" / "intrinsic_color.txt").write_text(_matrix_text(intrinsics), encoding="ascii")
     centered = np.eye(4)
     centered[:2, 3] = -np.array(scene.room.size[:2]) / 2
@@ -148,10 +187,10 @@ def _write_scan_facts(scene: Scene, folder: Path, scan_id: str, count: int) -> N
         "axisAlignment": " ".join(f"{value:f}" for value in alignment.ravel()),
         "colorHeight": height,
         "colorWidth": width,
-        "fx_color": f"{camera.intrinsics[0, 0]:f}",
-        "fy_color": f"{camera.intrinsics[1, 1]:f}",
-        "mx_color": f"{camera.intrinsics[0, 2]:f}",
-        "my_color": f"{camera.intrinsics[1, 2]:f}",
+        "fx_color": f"{known[0, 0]:f}",
+        "fy_color": f"{known[1, 1]:f}",
+        "mx_color": f"{known[0, 2]:f}",
+        "my_color": f"{known[1, 2]:f}",
         "numColorFrames": count,
         "sceneType": scene.room.kind.capitalize(),
     }

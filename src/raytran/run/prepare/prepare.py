@@ -22,6 +22,7 @@ from raytran.errors import ConfigError
 from raytran.rooms.benchmark import generate_rooms_v1, generate_rooms_v1_furniture
 from raytran.rooms.generate import generate_rooms
 from raytran.rooms.report import report_on_rooms
+from raytran.rooms.rooms_v2 import generate_rooms_v2
 from raytran.rooms.sweethome3d.furniture import import_furniture
 from raytran.run.config_dir import config_dir
 from raytran.run.prepare.check import check
@@ -29,13 +30,13 @@ from raytran.run.train.build import plain
 
 _log = logging.getLogger(__name__)
 
-DATASETS = ("rooms", "rooms-v1", "rooms-v1-furniture", "scan2cad", "boxes", "arkitscenes", "cads")
+DATASETS = ("rooms", "rooms-v1", "rooms-v1-furniture", "rooms-v2", "scan2cad", "boxes", "arkitscenes", "cads")
 
 _COUNTS = ("num_train", "num_val", "num_test")
 _FREE_ONLY = ("seed", "frames", "image_size", "min_objects", "max_objects", "room_size")
-"""Settings that dataset=rooms alone has; rooms-v1 fixes them."""
+"""Settings that dataset=rooms alone has; rooms-v1 and rooms-v2 fix them."""
 
-_FIXED = "rooms-v1 is the same for everybody; dataset=rooms makes rooms of your choice"
+_FIXED = "rooms-v1 and rooms-v2 are the same for everybody; dataset=rooms makes rooms of your choice"
 
 _PART = "it is of the test rooms of dataset=rooms-v1-furniture; training rooms never get what is held out"
 
@@ -63,6 +64,8 @@ def prepare(cfg: DictConfig) -> Any:
         return _prepare_rooms_v1(settings, output)
     if cfg.dataset == "rooms-v1-furniture":
         return _prepare_rooms_v1_furniture(settings, output)
+    if cfg.dataset == "rooms-v2":
+        return _prepare_rooms_v2(settings, output)
     if cfg.dataset == "scan2cad":
         return _prepare_scan2cad(settings, output)
     if cfg.dataset == "boxes":
@@ -112,6 +115,20 @@ def _prepare_rooms_v1_furniture(settings: dict[str, Any], output: Path) -> Any:
     )
     _log.info("%s\nthe rooms are in %s; evaluate on them with", report_on_rooms(report.root), report.root)
     _log.info("python -m raytran.evaluate checkpoint=CKPT data=scan2cad %s split=test", _data_root(output))
+    return report
+
+
+def _prepare_rooms_v2(settings: dict[str, Any], output: Path) -> Any:
+    _refuse(settings, *_FREE_ONLY, because=_FIXED)
+    _refuse(settings, "num_test", because="rooms-v2 has no test rooms, rooms-v1 has")
+    report = generate_rooms_v2(
+        output,
+        cads=_path(settings["cads"]),
+        processes=settings["processes"],
+        **_given(settings, "num_train", "num_val"),
+    )
+    _log.info("%s\nthe rooms are in %s", report_on_rooms(report.root), report.root)
+    _log.info("train on them with data=rooms-v2 %s", _data_root(output))
     return report
 
 
