@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from raytran.training.history import read_history
 from raytran.training.loggers import (
     WANDB_ID,
     MetricsTable,
     group_and_job,
-    read_history,
     tensorboard_logger,
     wandb_logger,
 )

@@ -22,18 +22,16 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from raytran.data.files import write_text
 from raytran.errors import ConfigError
-from raytran.limits import MAX_STEPS
+from raytran.training.history import read_table, step_of
 
 _log = logging.getLogger(__name__)
 
-METRICS = "metrics.csv"
 WANDB_ID = "wandb-id.txt"
 MLFLOW_ID = "mlflow-id.txt"
 
 _OFFLINE = ("offline", "dryrun")
 """Values of WANDB_MODE with which W&B keeps to this machine; the second is its former name."""
 
-_WITHOUT_COLUMN = ""
 _GROUP_RECORDS = ("sweep.json", "curriculum.json")
 """Files by which the folder of a sweep or of a curriculum is known."""
 
@@ -122,7 +120,7 @@ class MetricsTable(Logger):
         """Forget what was logged at ``step`` and later: the run does these steps again."""
         if not self.path.is_file():
             return
-        rows = [row for row in self._read() if (_step_of(row) or 0) < step]
+        rows = [row for row in self._read() if (step_of(row) or 0) < step]
         self._rewrite(rows)
 
     def _append(self, rows: list[dict[str, Any]]) -> None:
@@ -138,7 +136,7 @@ class MetricsTable(Logger):
 
     def _read(self) -> list[dict[str, Any]]:
         """Return the rows of the file and take over its columns."""
-        columns, rows = _read_table(self.path)
+        columns, rows = read_table(self.path)
         self._columns = columns or self._columns
         return rows
 
@@ -152,59 +150,6 @@ class MetricsTable(Logger):
         writer.writerows(rows)
         write_text(self.path, text.getvalue())
         self._columns = columns
-
-
-def _read_table(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
-    """Return the columns and rows of a run's table, as far as they are whole; nothing if there is none.
-
-    Left out are a last line that a kill cut short, a row without a step, and values without a column, which
-    earlier versions wrote on a disk that had been full.
-    """
-    if not path.is_file():
-        return [], []
-    text = path.read_text(encoding="utf-8", errors="replace")
-    lines = [line for line in text.splitlines(keepends=True) if line.endswith("\n") and "\0" not in line]
-    table = csv.DictReader(lines, restkey=_WITHOUT_COLUMN)
-    columns = list(table.fieldnames or ())
-    rows = [{name: row[name] for name in columns} for row in _rows(table)]
-    return columns, [row for row in rows if _step_of(row) is not None]
-
-
-def _rows(table: csv.DictReader[str]) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a table up to a damage: they are for pictures, and no run should end for one."""
-    try:
-        yield from table
-    except csv.Error as error:
-        _log.warning("the rest of the logged values is not read: %s", error)
-
-
-def _step_of(row: Mapping[str, Any]) -> int | None:
-    """Return the step of a row, None if it is damaged."""
-    step = _number(row.get("step"))
-    return int(step) if step is not None and 0 <= step <= MAX_STEPS else None
-
-
-def _number(cell: Any) -> float | None:
-    """Return the number in a cell, None if there is none; a loss may be infinite."""
-    try:
-        return float(cell)
-    except (TypeError, ValueError):
-        return None
-
-
-def read_history(folder: Path) -> dict[str, list[tuple[int, float]]]:
-    """Return what a run logged: name → (step, value) pairs by rising step.
-
-    Args:
-        folder: of the run.
-    """
-    history: dict[str, dict[int, float]] = {}
-    for row in _read_table(folder / METRICS)[1]:
-        for name, value in row.items():
-            number = _number(value)
-            if name not in ("step", "epoch") and number is not None:
-                history.setdefault(name, {})[int(row["step"])] = number
-    return {name: sorted(values.items()) for name, values in history.items()}
 
 
 class ContinuedTensorBoard(TensorBoardLogger):

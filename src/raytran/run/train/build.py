@@ -29,8 +29,9 @@ from raytran.training.callbacks.step_progress import LossBar, StepProgress
 from raytran.training.callbacks.telemetry import RunSettings, Telemetry
 from raytran.training.checkpoint_io import AtomicCheckpointIO
 from raytran.training.datamodule import SceneDataModule
+from raytran.training.history import METRICS
 from raytran.training.lightning_module import Reconstruction
-from raytran.training.loggers import METRICS, MetricsTable
+from raytran.training.loggers import MetricsTable
 from raytran.training.ranks import SyncedBatchNorm
 
 if TYPE_CHECKING:
