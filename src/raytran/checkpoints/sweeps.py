@@ -65,3 +65,19 @@ def differences(record: Mapping[str, Any]) -> list[list[str]]:
     jobs = [list(job["overrides"]) for job in record["jobs"]]
     shared = set.intersection(*map(set, jobs)) if len(jobs) > 1 else set()
     return [[item for item in job if item not in shared and item not in typed] for job in jobs]
+
+
+def varied_settings(run: Path) -> list[str]:
+    """Return the names of the settings in which the jobs of a sweep differ; none for a run without a sweep.
+
+    Args:
+        run: folder of a job, or of a stage of one.
+    """
+    for folder in run.absolute().parents:
+        if (folder / RECORD).is_file():
+            try:
+                own = differences(read_record(folder))
+            except ConfigError:
+                return []
+            return list(dict.fromkeys(item.lstrip("+~").partition("=")[0] for job in own for item in job))
+    return []

@@ -9,7 +9,7 @@ import logging
 import os
 import secrets
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from netrc import NetrcParseError, netrc
@@ -20,6 +20,7 @@ from urllib.parse import urlparse
 from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 
+from raytran.checkpoints.sweeps import RECORD, differences, read_record
 from raytran.data.files import write_text
 from raytran.errors import ConfigError
 from raytran.training.history import read_table, step_of
@@ -32,7 +33,7 @@ MLFLOW_ID = "mlflow-id.txt"
 _OFFLINE = ("offline", "dryrun")
 """Values of WANDB_MODE with which W&B keeps to this machine; the second is its former name."""
 
-_GROUP_RECORDS = ("sweep.json", "curriculum.json")
+_GROUP_RECORDS = (RECORD, "curriculum.json")
 """Files by which the folder of a sweep or of a curriculum is known."""
 
 
@@ -228,13 +229,19 @@ def _leave_out_event_writers(
         before(failure)
 
 
-def wandb_logger(*, project: str, name: str, save_dir: str) -> Any:
+def wandb_logger(*, project: str, name: str, save_dir: str, tags: Sequence[str | None] = ()) -> Any:
     """Return a logger to Weights & Biases, offline where the machine has no key; WANDB_MODE overrides.
 
     A resumed run goes on as the same run there: its id is kept in ``wandb-id.txt`` in the run's folder. But
     what was logged offline cannot be continued: ``wandb sync`` of a part may replace what was sent of another
     with the same id (wandb issues 3841, 5865). So each offline part, and what follows one, is a run of its
     own, ``NAME part 2``, in one group with the others. The runs of a sweep or a curriculum form a group too.
+
+    Args:
+        project: that the runs are in.
+        name: of the run; a job of a sweep adds what is its own, ``seed=1``.
+        save_dir: the run's folder.
+        tags: by which runs are found again; None is left out.
     """
     # Imported here: it takes a second, and most runs do without.
     from lightning.pytorch.loggers import WandbLogger
@@ -250,7 +257,7 @@ def wandb_logger(*, project: str, name: str, save_dir: str) -> Any:
     if group is None and (offline or len(ids) > 1):
         group = f"{folder.absolute().parent.name} {folder.absolute().name}"
     part = f"part {len(ids)}" if len(ids) > 1 else ""
-    return WandbLogger(
+    logger = WandbLogger(
         project=project,
         name=" ".join(word for word in (name, job, part) if word),
         group=group,
@@ -258,7 +265,11 @@ def wandb_logger(*, project: str, name: str, save_dir: str) -> Any:
         offline=offline,
         id=ids[-1],
         resume=None if offline else "allow",
+        tags=[str(tag) for tag in dict.fromkeys(tags) if tag],
     )
+    # Lightning hands on a setting that W&B no longer has, and warns of.
+    logger._wandb_init.pop("anonymous", None)
+    return logger
 
 
 class ContinuedMLFlow(MLFlowLogger):
@@ -362,15 +373,30 @@ def group_and_job(folder: Path) -> tuple[str | None, str]:
     """Return the sweep or curriculum that a run belongs to and its name in there; None and "" without one.
 
     Args:
-        folder: of the run, e.g. ``outputs/sweeps/2026-01-31_12-00-00/0_seed=1``, which gives
-            ``("sweeps 2026-01-31_12-00-00", "0_seed=1")``.
+        folder: of the run, e.g. ``outputs/sweeps/2026-01-31_12-00-00/0``, which gives
+            ``("sweeps 2026-01-31_12-00-00", "seed=1")``, by what tells the job from the others of the sweep.
     """
     folder = folder.absolute()
     groups = [path for path in folder.parents if any((path / record).is_file() for record in _GROUP_RECORDS)]
     if not groups:
         return None, ""
     outermost = groups[-1]  # a sweep of curricula is one group
-    return f"{outermost.parent.name} {outermost.name}", folder.relative_to(outermost).as_posix()
+    return f"{outermost.parent.name} {outermost.name}", _name_in(outermost, folder.relative_to(outermost))
+
+
+def _name_in(group: Path, run: Path) -> str:
+    """Return the name of a run in its group: its folder, but for a job of a sweep what is its own."""
+    if not (group / RECORD).is_file():
+        return run.as_posix()
+    try:
+        record = read_record(group)
+    except ConfigError:
+        return run.as_posix()  # a name is nothing to end a run for
+    for job, own in zip(record["jobs"], differences(record), strict=True):
+        if own and run.is_relative_to(job["folder"]):
+            stage = run.relative_to(job["folder"]).parts
+            return " ".join([*own, *stage])
+    return run.as_posix()
 
 
 def _ids_of_parts(folder: Path, *, offline: bool) -> list[str]:

@@ -12,7 +12,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from raytran.checkpoints.runs import write_finished
-from raytran.checkpoints.sweeps import differences, read_record
+from raytran.checkpoints.sweeps import differences, read_record, varied_settings
 from raytran.errors import ConfigError
 from raytran.run.sweep.faults import said_by_all
 from raytran.run.sweep.folder import last_value, own_settings, sweep_folder, write_record
@@ -164,6 +164,15 @@ def test_what_tells_jobs_apart():
     assert differences({"command": command, "jobs": jobs}) == [["seed=1"]]
     jobs.append({"overrides": ["seed=2", "preset=tiny", "data.root=a"], "folder": "1"})
     assert differences({"command": ["train", "sweep=mine"], "jobs": jobs}) == [["seed=1"], ["seed=2"]]
+
+
+def test_what_jobs_vary_is_known_in_their_folders(tmp_path):
+    jobs = [{"overrides": [f"seed={n}", f"+views.num_views={n}"], "folder": str(n)} for n in range(2)]
+    write_record(tmp_path, "train", ["seed=0,1"], jobs)
+    assert varied_settings(tmp_path / "1" / "stage2") == ["seed", "views.num_views"]
+    assert varied_settings(tmp_path.parent / "elsewhere") == []
+    (tmp_path / "sweep.json").write_text("{}")
+    assert varied_settings(tmp_path / "1") == []
 
 
 def test_the_spread_over_seeds_is_that_of_jobs_alike_in_all_else(tmp_path, caplog):
