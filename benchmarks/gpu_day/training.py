@@ -23,7 +23,7 @@ from raytran.checkpoints.runs import LAST, read_finished
 from raytran.run.entry import compose
 from raytran.run.path_settings import quoted
 from raytran.run.train.build import build_data
-from raytran.training.loggers import read_history
+from raytran.training.history import read_history
 
 STAGES = ("stage1", "stage2", "stage3")
 

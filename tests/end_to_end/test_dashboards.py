@@ -12,7 +12,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from raytran.run.entry import compose
 from raytran.run.train.fit import train
-from raytran.training.loggers import WANDB_ID, read_history
+from raytran.training.history import read_history
+from raytran.training.loggers import WANDB_ID
 
 STEPS = (2, 4)
 PICTURES = {"masks", "occupancy", "topdown", "boxes"}

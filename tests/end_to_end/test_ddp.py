@@ -13,7 +13,7 @@ import torch
 from raytran.checkpoints.runs import LAST, read_finished
 from raytran.run.entry import compose
 from raytran.run.train.fit import train
-from raytran.training.loggers import read_history
+from raytran.training.history import read_history
 
 STAGES = ("stage1", "stage2", "stage3")
 STEPS = 5

@@ -18,7 +18,7 @@ from raytran.errors import CheckpointError, DataError
 from raytran.run.entry import compose
 from raytran.run.export.export_model import export_model
 from raytran.run.train.fit import RANDOM_ENCODER
-from raytran.training.loggers import read_history
+from raytran.training.history import read_history
 
 from .runs import fit
 

@@ -20,7 +20,7 @@ from raytran.checkpoints.runs import FINISHED, LAST, read_finished
 from raytran.errors import CheckpointError, ConfigError
 from raytran.ops.triton import block_pairs
 from raytran.run.train.curriculum import run_curriculum
-from raytran.training.loggers import read_history
+from raytran.training.history import read_history
 
 from .runs import fit
 

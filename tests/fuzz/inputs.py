@@ -33,6 +33,7 @@ from raytran.checkpoints.file import PREFIX, write_checkpoint, write_weights
 from raytran.checkpoints.load import load_model, prediction_settings
 from raytran.checkpoints.metadata import checkpoint_metadata
 from raytran.checkpoints.runs import read_finished
+from raytran.checkpoints.sweeps import read_record
 from raytran.classes import PAPER_CLASSES, Classes
 from raytran.data.cache import MaskCache
 from raytran.data.files import SettingsRecord
@@ -58,7 +59,7 @@ from raytran.rooms.sweethome3d.mesh import read_piece
 from raytran.run.entry import compose
 from raytran.run.evaluate.results import read_curves
 from raytran.run.evaluate.score import evaluate_predictions
-from raytran.run.sweep.folder import last_value, read_record
+from raytran.run.sweep.folder import last_value
 from raytran.run.train.build import build_model, plain
 from raytran.structs import ObjectSet, ScenePrediction
 from raytran.viewer.data import VoxelVolume, read_viewer_scene, write_viewer_data

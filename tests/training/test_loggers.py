@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import resource
 import shutil
 from contextlib import contextmanager
@@ -10,11 +11,11 @@ from pathlib import Path
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from raytran.training.history import read_history
 from raytran.training.loggers import (
     WANDB_ID,
     MetricsTable,
     group_and_job,
-    read_history,
     tensorboard_logger,
     wandb_logger,
 )
@@ -260,5 +261,18 @@ def test_runs_of_a_sweep_or_a_curriculum_are_a_group(tmp_path):
     (tmp_path / "sweeps" / "monday" / "0").mkdir()
     (tmp_path / "sweeps" / "monday" / "0" / "curriculum.json").touch()
     assert group_and_job(job) == ("monday 0", "stage1")
-    (tmp_path / "sweeps" / "monday" / "sweep.json").touch()
-    assert group_and_job(job) == ("sweeps monday", "0/stage1")
+    names = ([["seed=1"], ["seed=2"]], "seed=1 stage1"), ([["seed=1"]] * 2, "0/stage1")
+    for overrides, name in names:
+        jobs = [{"overrides": own, "folder": str(number)} for number, own in enumerate(overrides)]
+        record = {"command": ["curriculum"], "jobs": jobs}
+        (tmp_path / "sweeps" / "monday" / "sweep.json").write_text(json.dumps(record))
+        assert group_and_job(job) == ("sweeps monday", name)
+
+
+def test_wandb_is_told_tags_and_no_setting_that_it_has_given_up(tmp_path):
+    tags = ["tiny", "stage1", None, "tiny"]
+    logger = wandb_logger(
+        project="p", name="n", save_dir=str(tmp_path), tags=["tiny", "stage1", None, "tiny"]
+    )
+    assert logger._wandb_init["tags"] == ["tiny", "stage1"]
+    assert "anonymous" not in logger._wandb_init

@@ -9,7 +9,7 @@ import logging
 import os
 import secrets
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from netrc import NetrcParseError, netrc
@@ -20,21 +20,20 @@ from urllib.parse import urlparse
 from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 
+from raytran.checkpoints.sweeps import RECORD, differences, read_record
 from raytran.data.files import write_text
 from raytran.errors import ConfigError
-from raytran.limits import MAX_STEPS
+from raytran.training.history import read_table, step_of
 
 _log = logging.getLogger(__name__)
 
-METRICS = "metrics.csv"
 WANDB_ID = "wandb-id.txt"
 MLFLOW_ID = "mlflow-id.txt"
 
 _OFFLINE = ("offline", "dryrun")
 """Values of WANDB_MODE with which W&B keeps to this machine; the second is its former name."""
 
-_WITHOUT_COLUMN = ""
-_GROUP_RECORDS = ("sweep.json", "curriculum.json")
+_GROUP_RECORDS = (RECORD, "curriculum.json")
 """Files by which the folder of a sweep or of a curriculum is known."""
 
 
@@ -122,7 +121,7 @@ class MetricsTable(Logger):
         """Forget what was logged at ``step`` and later: the run does these steps again."""
         if not self.path.is_file():
             return
-        rows = [row for row in self._read() if (_step_of(row) or 0) < step]
+        rows = [row for row in self._read() if (step_of(row) or 0) < step]
         self._rewrite(rows)
 
     def _append(self, rows: list[dict[str, Any]]) -> None:
@@ -138,7 +137,7 @@ class MetricsTable(Logger):
 
     def _read(self) -> list[dict[str, Any]]:
         """Return the rows of the file and take over its columns."""
-        columns, rows = _read_table(self.path)
+        columns, rows = read_table(self.path)
         self._columns = columns or self._columns
         return rows
 
@@ -152,59 +151,6 @@ class MetricsTable(Logger):
         writer.writerows(rows)
         write_text(self.path, text.getvalue())
         self._columns = columns
-
-
-def _read_table(path: Path) -> tuple[list[str], list[dict[str, Any]]]:
-    """Return the columns and rows of a run's table, as far as they are whole; nothing if there is none.
-
-    Left out are a last line that a kill cut short, a row without a step, and values without a column, which
-    earlier versions wrote on a disk that had been full.
-    """
-    if not path.is_file():
-        return [], []
-    text = path.read_text(encoding="utf-8", errors="replace")
-    lines = [line for line in text.splitlines(keepends=True) if line.endswith("\n") and "\0" not in line]
-    table = csv.DictReader(lines, restkey=_WITHOUT_COLUMN)
-    columns = list(table.fieldnames or ())
-    rows = [{name: row[name] for name in columns} for row in _rows(table)]
-    return columns, [row for row in rows if _step_of(row) is not None]
-
-
-def _rows(table: csv.DictReader[str]) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a table up to a damage: they are for pictures, and no run should end for one."""
-    try:
-        yield from table
-    except csv.Error as error:
-        _log.warning("the rest of the logged values is not read: %s", error)
-
-
-def _step_of(row: Mapping[str, Any]) -> int | None:
-    """Return the step of a row, None if it is damaged."""
-    step = _number(row.get("step"))
-    return int(step) if step is not None and 0 <= step <= MAX_STEPS else None
-
-
-def _number(cell: Any) -> float | None:
-    """Return the number in a cell, None if there is none; a loss may be infinite."""
-    try:
-        return float(cell)
-    except (TypeError, ValueError):
-        return None
-
-
-def read_history(folder: Path) -> dict[str, list[tuple[int, float]]]:
-    """Return what a run logged: name → (step, value) pairs by rising step.
-
-    Args:
-        folder: of the run.
-    """
-    history: dict[str, dict[int, float]] = {}
-    for row in _read_table(folder / METRICS)[1]:
-        for name, value in row.items():
-            number = _number(value)
-            if name not in ("step", "epoch") and number is not None:
-                history.setdefault(name, {})[int(row["step"])] = number
-    return {name: sorted(values.items()) for name, values in history.items()}
 
 
 class ContinuedTensorBoard(TensorBoardLogger):
@@ -283,13 +229,19 @@ def _leave_out_event_writers(
         before(failure)
 
 
-def wandb_logger(*, project: str, name: str, save_dir: str) -> Any:
+def wandb_logger(*, project: str, name: str, save_dir: str, tags: Sequence[str | None] = ()) -> Any:
     """Return a logger to Weights & Biases, offline where the machine has no key; WANDB_MODE overrides.
 
     A resumed run goes on as the same run there: its id is kept in ``wandb-id.txt`` in the run's folder. But
     what was logged offline cannot be continued: ``wandb sync`` of a part may replace what was sent of another
     with the same id (wandb issues 3841, 5865). So each offline part, and what follows one, is a run of its
     own, ``NAME part 2``, in one group with the others. The runs of a sweep or a curriculum form a group too.
+
+    Args:
+        project: that the runs are in.
+        name: of the run; a job of a sweep adds what is its own, ``seed=1``.
+        save_dir: the run's folder.
+        tags: by which runs are found again; None is left out.
     """
     # Imported here: it takes a second, and most runs do without.
     from lightning.pytorch.loggers import WandbLogger
@@ -305,7 +257,7 @@ def wandb_logger(*, project: str, name: str, save_dir: str) -> Any:
     if group is None and (offline or len(ids) > 1):
         group = f"{folder.absolute().parent.name} {folder.absolute().name}"
     part = f"part {len(ids)}" if len(ids) > 1 else ""
-    return WandbLogger(
+    logger = WandbLogger(
         project=project,
         name=" ".join(word for word in (name, job, part) if word),
         group=group,
@@ -313,7 +265,11 @@ def wandb_logger(*, project: str, name: str, save_dir: str) -> Any:
         offline=offline,
         id=ids[-1],
         resume=None if offline else "allow",
+        tags=[str(tag) for tag in dict.fromkeys(tags) if tag],
     )
+    # Lightning hands on a setting that W&B no longer has, and warns of.
+    logger._wandb_init.pop("anonymous", None)
+    return logger
 
 
 class ContinuedMLFlow(MLFlowLogger):
@@ -417,15 +373,30 @@ def group_and_job(folder: Path) -> tuple[str | None, str]:
     """Return the sweep or curriculum that a run belongs to and its name in there; None and "" without one.
 
     Args:
-        folder: of the run, e.g. ``outputs/sweeps/2026-01-31_12-00-00/0_seed=1``, which gives
-            ``("sweeps 2026-01-31_12-00-00", "0_seed=1")``.
+        folder: of the run, e.g. ``outputs/sweeps/2026-01-31_12-00-00/0``, which gives
+            ``("sweeps 2026-01-31_12-00-00", "seed=1")``, by what tells the job from the others of the sweep.
     """
     folder = folder.absolute()
     groups = [path for path in folder.parents if any((path / record).is_file() for record in _GROUP_RECORDS)]
     if not groups:
         return None, ""
     outermost = groups[-1]  # a sweep of curricula is one group
-    return f"{outermost.parent.name} {outermost.name}", folder.relative_to(outermost).as_posix()
+    return f"{outermost.parent.name} {outermost.name}", _name_in(outermost, folder.relative_to(outermost))
+
+
+def _name_in(group: Path, run: Path) -> str:
+    """Return the name of a run in its group: its folder, but for a job of a sweep what is its own."""
+    if not (group / RECORD).is_file():
+        return run.as_posix()
+    try:
+        record = read_record(group)
+    except ConfigError:
+        return run.as_posix()  # a name is nothing to end a run for
+    for job, own in zip(record["jobs"], differences(record), strict=True):
+        if own and run.is_relative_to(job["folder"]):
+            stage = run.relative_to(job["folder"]).parts
+            return " ".join([*own, *stage])
+    return run.as_posix()
 
 
 def _ids_of_parts(folder: Path, *, offline: bool) -> list[str]:

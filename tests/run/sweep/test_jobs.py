@@ -12,9 +12,14 @@ import pytest
 from omegaconf import OmegaConf
 
 from raytran.checkpoints.runs import write_finished
+from raytran.checkpoints.sweeps import differences, read_record, varied_settings
 from raytran.errors import ConfigError
-from raytran.run.sweep.folder import last_value, own_settings, read_record, sweep_folder, write_record
-from raytran.run.sweep.launcher import FAILED, FINISHED, RESULTS, Job, run_jobs, write_results
+from raytran.run.sweep.faults import said_by_all
+from raytran.run.sweep.folder import last_value, own_settings, sweep_folder, write_record
+from raytran.run.sweep.job import CONSOLE, FAILED, FINISHED, Job
+from raytran.run.sweep.launcher import run_jobs
+from raytran.run.sweep.results import RESULTS, write_results
+from raytran.run.train.memory import TOO_SMALL
 
 WRITES_WHAT_IT_SEES = textwrap.dedent(
     """
@@ -151,3 +156,64 @@ def test_a_sweep_is_found_by_what_was_typed(tmp_path):
     (earlier / "sweep.json").write_text("{")
     with pytest.raises(ConfigError, match=r"sweep\.json is damaged: delete it"):
         found("preset=tiny", "seed=1,2")
+
+
+def test_what_tells_jobs_apart():
+    jobs = [{"overrides": ["seed=1", "preset=tiny", "data.root=a"], "folder": "0"}]
+    command = ["train", "data.root=a", "preset=tiny", "seed=1,2"]
+    assert differences({"command": command, "jobs": jobs}) == [["seed=1"]]
+    jobs.append({"overrides": ["seed=2", "preset=tiny", "data.root=a"], "folder": "1"})
+    assert differences({"command": ["train", "sweep=mine"], "jobs": jobs}) == [["seed=1"], ["seed=2"]]
+
+
+def test_what_jobs_vary_is_known_in_their_folders(tmp_path):
+    jobs = [{"overrides": [f"seed={n}", f"+views.num_views={n}"], "folder": str(n)} for n in range(2)]
+    write_record(tmp_path, "train", ["seed=0,1"], jobs)
+    assert varied_settings(tmp_path / "1" / "stage2") == ["seed", "views.num_views"]
+    assert varied_settings(tmp_path.parent / "elsewhere") == []
+    (tmp_path / "sweep.json").write_text("{}")
+    assert varied_settings(tmp_path / "1") == []
+
+
+def test_the_spread_over_seeds_is_that_of_jobs_alike_in_all_else(tmp_path, caplog):
+    caplog.set_level("INFO", "raytran")
+    jobs = []
+    for number, (rate, seed) in enumerate((rate, seed) for rate in ("1e-3", "1e-4") for seed in (0, 1, 2)):
+        one = job(tmp_path, number)
+        one.overrides = (f"optimizer.learning_rate={rate}", f"seed={seed}")
+        jobs.append(finish(one))
+    record(tmp_path, jobs)
+    write_results(tmp_path, jobs)
+    # 0.05, 0.15, 0.25 and 0.35, 0.45, 0.55
+    assert "optimizer.learning_rate=1e-3, 3 seeds: val/total = 0.15 ± 0.1" in caplog.text
+    assert "optimizer.learning_rate=1e-4, 3 seeds: val/total = 0.45 ± 0.1" in caplog.text
+
+
+def failed(folder, number, said):
+    one = job(folder, number)
+    one.folder.mkdir()
+    (one.folder / CONSOLE).write_text(f"[12:00:00] a line\n{said}\n")
+    one.status = FAILED
+    return one
+
+
+@pytest.mark.parametrize(
+    ("said", "shared"),
+    [
+        (("raytran: no rooms", "raytran: no rooms"), "no rooms"),
+        (("raytran: no rooms",), None),
+        (("raytran: no rooms in a", "raytran: no rooms in b"), None),
+        (("KeyError: 3", "KeyError: 3"), None),
+        ((f"raytran: memory {TOO_SMALL}", f"raytran: memory {TOO_SMALL}"), None),
+    ],
+)
+def test_when_jobs_share_a_fault(tmp_path, said, shared):
+    jobs = [failed(tmp_path, number, line) for number, line in enumerate(said)]
+    assert said_by_all([*jobs, job(tmp_path, 9)]) == shared
+
+
+def test_a_fault_is_not_shared_once_a_job_has_taken_a_step(tmp_path):
+    jobs = [failed(tmp_path, number, "raytran: no rooms") for number in range(2)]
+    assert said_by_all(jobs) == "no rooms"
+    (jobs[1].folder / "metrics.csv").write_text("step,epoch,train/total\n0,0,1.5\n")
+    assert said_by_all(jobs) is None

@@ -27,6 +27,8 @@ JOB = textwrap.dedent(
     kept = ("RANK", "CUDA_VISIBLE_DEVICES", "OMP_NUM_THREADS", "HYDRA_FULL_ERROR")
     ranks = {k: v for k, v in os.environ.items() if k.endswith(kept)}
     (folder / "environment.json").write_text(json.dumps(ranks))
+    if seed > 90:
+        sys.exit("raytran: " + os.environ["JOB_SAYS"].replace("SEED", str(seed)))
     if seed == 13 and not (folder.parent.parent / "mended").exists():
         sys.exit("thirteen is no seed")
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
@@ -35,7 +37,7 @@ JOB = textwrap.dedent(
     awaited = [pathlib.Path(folder.parent, name) for name in os.environ.get("JOB_WAITS_FOR", "").split()]
     while not all(path.exists() for path in awaited):
         time.sleep(0.02)
-    (folder / "value").write_text(str(seed / 10))
+    (folder / "metrics.csv").write_text(f"step,epoch,val/occupancy/iou\\n3,0,{seed / 10}\\n")
     mark = {"stage": "stage1", "preset": "tiny", "experiment": "stage1", "checkpoint": "x", "steps": 4}
     (folder / "finished.json").write_text(json.dumps({**mark, "time": "2026"}))
     (folder / "span.json").write_text(json.dumps([began, time.time()]))
@@ -43,13 +45,7 @@ JOB = textwrap.dedent(
 )
 COMMAND = """
 import sys
-from raytran.run.sweep import launcher
-from raytran.run.sweep.launcher import Job
-LOGGED = "val/occupancy/iou"
-# Lightning's part in reading a table of metrics would take longer than everything else here.
-launcher.last_value = lambda folder, metric: (
-    float((folder / "value").read_text()) if metric == LOGGED else None, [LOGGED]
-)
+from raytran.run.sweep.job import Job
 real = Job.command
 Job.command = lambda job, general: [sys.executable, "job.py", *real(job, general)[3:]]
 from raytran.train import main
@@ -124,12 +120,15 @@ def test_each_job_has_a_folder_and_the_table_has_its_metric(sweep):
         ("val/occupancy/iou", "0.2", "4"),
     ]
     assert "val/occupancy/iou = 0.2" in said
+    assert "job 1 starts: seed=2 (2 of 2, " in said
+    assert "1 of 2 jobs done, about " in said
+    assert "all, 2 seeds: val/occupancy/iou = 0.15 ± 0.071" in said
     (call,) = calls(folder / "1")
     words = call.split()
     assert "seed=2" in words
     assert f'output_dir="{folder / "1"}"' in words
-    # A job that was killed goes on, its bar does not fill the log, Hydra's own settings reach it.
-    assert {"resume=auto", "progress_bar=none", "hydra.verbose=false", "hydra.mode=RUN"} <= set(words)
+    # A job that was killed goes on, ten lines of progress are in its log, Hydra's own settings reach it.
+    assert {"resume=auto", "progress_bar=rich", "hydra.verbose=false", "hydra.mode=RUN"} <= set(words)
     # No rank is left of whatever ran here before; nor what the launcher has set for itself.
     environment = json.loads((folder / "1" / "environment.json").read_text())
     assert not {"RANK", "LOCAL_RANK", "HYDRA_FULL_ERROR"} & set(environment)
@@ -140,6 +139,8 @@ def test_what_failed_runs_again_and_nothing_else(sweep):
     assert code == 1
     assert "job 1 failed with exit code 1: thirteen is no seed" in said
     assert "Traceback" not in said
+    assert "Error executing job" not in said, "Hydra's line before ours"
+    assert said.strip().splitlines()[-1].startswith("raytran: job 1 failed (see ")
     assert [row["status"] for row in rows(sweeps(sweep)[0])] == ["finished", "failed", "finished"]
     (sweep.folder / "outputs" / "sweeps" / "mended").touch()
     code, said = sweep("seed=1,13,3", "launcher.parallel=2")
@@ -148,6 +149,25 @@ def test_what_failed_runs_again_and_nothing_else(sweep):
     assert [len(calls(folder / number)) for number in "012"] == [1, 2, 1]
     assert [row["status"] for row in rows(folder)] == ["finished"] * 3
     assert [row["value"] for row in rows(folder)] == ["0.1", "1.3", "0.3"]
+
+
+def test_what_two_jobs_fail_of_before_their_first_step_stops_the_sweep(sweep):
+    code, said = sweep("seed=91,92,93,94", JOB_SAYS="there are no rooms in nowhere")
+    assert code == 1
+    assert "all fail of the same: jobs 2, 3 will not start" in said
+    assert said.strip().splitlines()[-1] == (
+        "raytran: there are no rooms in nowhere (jobs 0, 1 failed of this before the first step)"
+    )
+    statuses = ["failed", "failed", "not started", "not started"]
+    assert [row["status"] for row in rows(sweeps(sweep)[0])] == statuses
+
+
+def test_a_sweep_whose_jobs_all_lack_their_parent_starts_none(sweep):
+    code, said = sweep("experiment=stage2", "seed=1,2,3")
+    assert code == 1
+    (line,) = said.strip().splitlines()
+    assert line.startswith("raytran: no finished run of stage1 with preset tiny in outputs=outputs: run `")
+    assert not list(sweeps(sweep)[0].glob("*/calls"))
 
 
 def test_a_named_folder_can_grow(sweep):

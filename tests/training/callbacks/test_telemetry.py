@@ -7,6 +7,7 @@ import torch
 from lightning.pytorch.callbacks import LearningRateMonitor
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
 
 from raytran.training.callbacks import telemetry
 from raytran.training.callbacks.telemetry import HP_METRIC, RunSettings, Telemetry
@@ -98,3 +99,14 @@ def test_a_metric_that_was_not_logged_is_no_score(fit, tmp_path):
     board = TensorBoardLogger(tmp_path, name="", version="")
     fit(RunSettings({"seed": 3}, metric="val/none"), experiment="stage1", loggers=board, max_steps=1)
     assert HP_METRIC not in EventAccumulator(str(tmp_path)).Reload().Tags()["scalars"]
+
+
+def test_columns_of_the_table_start_with_what_differs(fit, tmp_path):
+    settings = {"model": {"_target_": "raytran.model.RayTran", "width": 3}, "seed": 1, "views": {"num": 2}}
+    board = TensorBoardLogger(tmp_path, name="", version="")
+    shown = RunSettings(settings, metric="train/total", first=["views", "seed", "absent"])
+    fit(shown, experiment="stage1", loggers=board, max_steps=1)
+    events = EventAccumulator(str(tmp_path)).Reload()
+    content = events.summary_metadata["_hparams_/experiment"].plugin_data.content
+    columns = HParamsPluginData.FromString(content).experiment.hparam_infos
+    assert [column.name for column in columns] == ["views.num", "seed", "model.width"]

@@ -20,7 +20,7 @@ from raytran.pictures.palette import INK
 from raytran.pictures.panels import contact_sheet, draw_frames, draw_masks, draw_occupancy
 from raytran.run.train.fit import FitResult
 from raytran.structs import SceneBatch, ScenePrediction
-from raytran.training.loggers import read_history
+from raytran.training.history import read_history
 
 COLUMNS = {
     "train": "training rooms",

@@ -2,7 +2,7 @@
 """The folder of a sweep, found again by the same command, and the results that its jobs left there.
 
 A sweep lives in ``<outputs>/sweeps/<time>``, apart from single runs, so that ``init_from=auto`` never takes
-one of its jobs. ``sweep.json`` holds the command and, for each job, its settings and folder.
+one of its jobs.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from raytran.checkpoints.runs import read_finished
+from raytran.checkpoints.sweeps import RECORD, read_record
 from raytran.data.files import write_json
-from raytran.data.text import read_json_object
-from raytran.errors import ConfigError, DataError
+from raytran.errors import ConfigError
+from raytran.training.history import read_history
 
-RECORD = "sweep.json"
 THIS_SWEEP = "RAYTRAN_SWEEP_DIR"
 """Environment variable that hands a sweep's folder on to its jobs."""
 
@@ -54,42 +54,6 @@ def sweep_folder(outputs: str, resume: str, program: str, overrides: Sequence[st
     return str(parent / datetime.now().strftime("%Y-%m-%d_%H-%M-%S"))
 
 
-def read_record(folder: Path) -> dict[str, Any]:
-    """Return what ``sweep.json`` says: ``command`` and ``jobs``, a list of ``overrides`` and ``folder``.
-
-    Raises:
-        ConfigError: the file is damaged.
-    """
-    path = folder / RECORD
-    damaged = ConfigError(f"{path} is damaged: delete it, or start a new sweep with launcher.resume=none")
-    try:
-        record = read_json_object(path)
-    except DataError as error:
-        raise damaged from error
-    command, jobs = record.get("command"), record.get("jobs")
-    if not _are_texts(command) or not isinstance(jobs, list):
-        raise damaged
-    for job in jobs:
-        is_job = isinstance(job, dict) and _is_below(job.get("folder")) and _are_texts(job.get("overrides"))
-        if not is_job:
-            raise damaged
-    return {"command": command, "jobs": jobs}
-
-
-def _is_below(folder: Any) -> bool:
-    """Say whether it is the path of a folder in another, which does not lead out of that."""
-    return (
-        isinstance(folder, str)
-        and folder.isprintable()
-        and not Path(folder).is_absolute()
-        and ".." not in Path(folder).parts
-    )
-
-
-def _are_texts(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(item, str) for item in value)
-
-
 def write_record(
     folder: Path, program: str, overrides: Sequence[str], jobs: Sequence[Mapping[str, Any]]
 ) -> None:
@@ -109,9 +73,6 @@ def last_value(folder: Path, metric: str) -> tuple[float | None, list[str]]:
         folder: of the job: a run, or a curriculum, of which the latest stage that has the metric counts.
         metric: its name, e.g. ``val/occupancy/iou``.
     """
-    # Imported here so that commands which sweep nothing, --help above all, answer at once.
-    from raytran.training.loggers import read_history
-
     names: set[str] = set()
     for run in [folder, *_stages(folder)]:
         history = read_history(run)

@@ -7,35 +7,32 @@ Lightning takes the next job for a part of the first.
 
 from __future__ import annotations
 
-import csv
-import io
 import logging
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.utils import JobReturn, JobStatus, configure_log
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from raytran.checkpoints.runs import one_at_a_time, read_finished
-from raytran.data.files import write_text
+from raytran.checkpoints.sweeps import RECORD, differences, read_record
 from raytran.errors import ConfigError, RaytranError
-from raytran.run.entry import typed_config_dir, typed_settings, user_environment
-from raytran.run.path_settings import quoted
-from raytran.run.sweep.folder import RECORD, THIS_SWEEP, last_value, own_settings, read_record, write_record
+from raytran.run.entry import typed_settings, user_environment
+from raytran.run.sweep.faults import no_parent, said_by_all
+from raytran.run.sweep.folder import THIS_SWEEP, own_settings, write_record
+from raytran.run.sweep.job import CONSOLE, FAILED, FINISHED, STOPPED, Job
+from raytran.run.sweep.progress import SweepProgress
+from raytran.run.sweep.results import write_results
 from raytran.training.callbacks.stop_signals import forward_signals
 
 _log = logging.getLogger(__name__)
-
-CONSOLE, RESULTS = "console.log", "results.csv"
-FINISHED, FAILED, STOPPED, NOT_STARTED = "finished", "failed", "stopped", "not started"
 
 _NOT_FOR_A_JOB = {
     *("RANK", "LOCAL_RANK", "GLOBAL_RANK", "GROUP_RANK", "NODE_RANK", "ROLE_RANK", "WORLD_SIZE"),
@@ -45,59 +42,13 @@ _NOT_FOR_A_JOB = {
 }
 """Environment variables that tell a process that it is one rank of several, which a job is not."""
 
+_OF_TERMINALS = {"FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"}
+"""Environment variables by which rich would draw bars into a file."""
+
 _OF_SWEEPS = ("hydra.sweep", "hydra/sweep", "hydra.launcher", "hydra/launcher", "hydra.mode", "hydra.run.dir")
 """Settings of Hydra that are not for a single job."""
 
 _POLL_SECONDS = 0.2
-
-
-@dataclass
-class Job:
-    """One job of a sweep.
-
-    Attributes:
-        number: in the sweep, from 0.
-        overrides: its settings as the sweeper gave them.
-        folder: of its run.
-        config: composed from the settings.
-        title: those of its settings that not all jobs share.
-        status: one of the four above.
-        process: its command, once that has been started.
-        gpus: the GPUs that it has for itself while it runs.
-    """
-
-    number: int
-    overrides: tuple[str, ...]
-    folder: Path
-    config: DictConfig
-    title: str = ""
-    status: str = NOT_STARTED
-    process: subprocess.Popen[bytes] | None = None
-    gpus: list[str] = field(default_factory=list)
-
-    def command(self, general: Sequence[str]) -> list[str]:
-        """Return the command line.
-
-        Args:
-            general: settings of Hydra itself that hold for every job.
-        """
-        own = own_settings(self.overrides)
-        typed = {item.lstrip("+~").split("=")[0] for item in own}
-        usual = {"resume": "auto", "progress_bar": "none"}
-        added = [f"{name}={value}" for name, value in usual.items() if name not in typed]
-        program = f"raytran.{self.config.hydra.job.config_name}"
-        words = [*own, *added, f"output_dir={quoted(self.folder)}", *general, "hydra.mode=RUN"]
-        return [sys.executable, "-m", program, *typed_config_dir(self.config.hydra), *words]
-
-    def gpus_needed(self, total: int) -> int:
-        """Return how many of the machine's ``total`` GPUs the job needs for itself."""
-        trainer = self.config.trainer
-        if str(trainer.accelerator) == "cpu":
-            return 0
-        try:
-            return min(int(trainer.devices), total) if int(trainer.devices) >= 0 else total
-        except (TypeError, ValueError):
-            return total  # a list of devices or "auto": nothing may run beside it
 
 
 def launch(
@@ -119,7 +70,8 @@ def launch(
         Per job its return value, the last value of its ``optimized_metric``, or its failure.
 
     Raises:
-        ConfigError: the same sweep is running already, or a setting makes no sense.
+        ConfigError: the same sweep is running already, a setting makes no sense, or all jobs have the same
+            fault.
         SystemExit: a signal has stopped the sweep; its jobs have got it too and have ended.
     """
     configure_log(config.hydra.hydra_logging, config.hydra.verbose)
@@ -128,6 +80,9 @@ def launch(
     with one_at_a_time(folder) as lock:
         jobs = _jobs(config, loader, job_overrides, folder)
         gpus = _gpus() if any(job.config.trainer.accelerator != "cpu" for job in jobs) else []
+        refused = no_parent(jobs)
+        if refused is not None:
+            raise refused
         typed = [str(item) for item in config.hydra.overrides.hydra]
         general = [item for item in typed if not item.lstrip("+~").startswith(_OF_SWEEPS)]
         stopped_by = run_jobs(jobs, gpus, general, lock, limit=_limit(parallel, jobs, gpus))
@@ -135,6 +90,10 @@ def launch(
     if stopped_by:
         _log.info("stopped; the same command goes on with this sweep")
         raise SystemExit(128 + stopped_by)
+    shared = said_by_all(jobs)
+    if shared is not None:
+        failed = [job for job in jobs if job.status == FAILED]
+        raise ConfigError(f"{shared} ({_named(failed)} failed of this before the first step)")
     return [_job_return(job, values[job.number]) for job in jobs]
 
 
@@ -157,9 +116,9 @@ def _jobs(
         jobs.append(Job(number, tuple(overrides), folder / recorded[number]["folder"], composed))
     typed = typed_settings(config.hydra)
     write_record(folder, config.hydra.job.config_name, typed, recorded)
-    shared = set.intersection(*(set(job["overrides"]) for job in recorded)) if len(recorded) > 1 else set()
+    titles = differences(read_record(folder))
     for job in jobs:
-        job.title = " ".join(item for item in own_settings(job.overrides) if item not in shared)
+        job.title = " ".join(titles[job.number])
     return jobs
 
 
@@ -179,16 +138,21 @@ def run_jobs(
         The number of the signal that has stopped the sweep, or 0.
     """
     free, running, waiting = list(gpus), list[Job](), deque[Job]()
-    for job in {job.number: job for job in jobs}.values():  # a sampler may draw the same twice
+    chosen = list({job.number: job for job in jobs}.values())  # a sampler may draw the same twice
+    for job in chosen:
         if read_finished(job.folder) is None:
             waiting.append(job)
         else:
-            _log.info("job %d has finished before: %s", job.number, job.title)
+            job.status = FINISHED
+            _log.info("job %d has finished before: %s", job.number, job.name)
+    silent = any(job.config.get("progress_bar") == "none" for job in chosen)
     stopped_by = 0
 
     def stop(signum: int) -> None:
         """Let the jobs save themselves; the second signal ends them at once."""
         nonlocal stopped_by
+        if not stopped_by:
+            _log.info("stopping when the jobs have saved themselves; press Ctrl-C again to stop at once")
         for job in running:
             if job.process is None:
                 continue
@@ -198,7 +162,7 @@ def run_jobs(
                 job.process.send_signal(signal.SIGTERM)
         stopped_by = signum
 
-    with forward_signals(stop):
+    with forward_signals(stop), SweepProgress(chosen, silent=silent) as progress:
         while running or (waiting and not stopped_by):
             while waiting and not stopped_by and len(running) < limit:
                 needed = waiting[0].gpus_needed(len(gpus))
@@ -206,13 +170,21 @@ def run_jobs(
                     break
                 job = waiting.popleft()
                 job.gpus = [free.pop(0) for _ in range(needed)]
+                place = f"{len(chosen) - len(waiting)} of {len(chosen)}"
+                _log.info("job %d starts: %s (%s, %s)", job.number, job.name, place, job.folder / CONSOLE)
                 _start(job, general, lock, side_by_side=limit)
                 running.append(job)
+                progress.show(running)
             time.sleep(_POLL_SECONDS)
             for job in [job for job in running if job.process and job.process.poll() is not None]:
                 running.remove(job)
                 free += job.gpus
                 _end(job, stopped=bool(stopped_by))
+                progress.ended(job, running)
+                if waiting and said_by_all(jobs) is not None:
+                    _log.error("all fail of the same: %s will not start", _named(waiting))
+                    waiting.clear()
+            progress.look(running)
     return stopped_by
 
 
@@ -224,7 +196,6 @@ def _start(job: Job, general: Sequence[str], lock: int, *, side_by_side: int) ->
         # Each would take all cores otherwise, and wait for the others most of the time.
         environment.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // side_by_side)))
     job.folder.mkdir(parents=True, exist_ok=True)
-    _log.info("job %d starts: %s (%s)", job.number, job.title, job.folder / CONSOLE)
     with (job.folder / CONSOLE).open("ab") as console:
         job.process = subprocess.Popen(
             job.command(general),
@@ -245,70 +216,13 @@ def _end(job: Job, *, stopped: bool) -> None:
         return
     job.status = STOPPED if stopped else FAILED
     if not stopped:
-        _log.error("job %d failed with exit code %s: %s", job.number, code, _last_line(job.folder / CONSOLE))
+        _log.error("job %d failed with exit code %s: %s", job.number, code, job.said_last())
 
 
-def _last_line(path: Path) -> str:
-    """Return the last thing a command said, without Hydra's advice on how to hear more."""
-    lines = path.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-    said = [line for line in lines if line.strip() and "HYDRA_FULL_ERROR" not in line]
-    return said[-1] if said else "it said nothing"
-
-
-def write_results(folder: Path, jobs: Sequence[Job]) -> dict[int, float | None]:
-    """Write ``results.csv`` with a row for every job of the sweep, and log the rows.
-
-    What has finished is read from the jobs' folders, whichever call has run it.
-
-    Returns:
-        The last value of its metric, or None, for each job by number.
-    """
-    status = {job.number: job.status for job in jobs}
-    metric = str(jobs[0].config.optimized_metric) if jobs else ""
-    rows: list[dict[str, object]] = []
-    values: dict[int, float | None] = {}
-    for number, recorded in enumerate(read_record(folder)["jobs"]):
-        mark = read_finished(folder / recorded["folder"])
-        values[number] = _value(number, folder / recorded["folder"], metric) if mark else None
-        rows.append(
-            dict(item.partition("=")[::2] for item in recorded["overrides"])
-            | {
-                "job": number,
-                "status": FINISHED if mark else status.get(number, NOT_STARTED),
-                "metric": metric,
-                "value": values[number],
-                "steps": mark.steps if mark else None,
-                "folder": recorded["folder"],
-            }
-        )
-    first = ("job", "status", "metric", "value", "steps", "folder")
-    settings = sorted({name for row in rows for name in row} - set(first))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, fieldnames=[*first, *settings], restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_text(folder / RESULTS, text.getvalue())
-    varied = [name for name in settings if len({row.get(name) for row in rows}) > 1]
-    for row in rows:
-        _log.info("job %s: %s", row["job"], _line(row, varied))
-    return values
-
-
-def _value(number: int, folder: Path, metric: str) -> float | None:
-    """Return the last value of a metric, and say which ones there are where there is none."""
-    value, logged = last_value(folder, metric)
-    if logged and value is None:
-        others = ", ".join(name for name in logged if name.startswith("val/")) or "none"
-        _log.warning("job %d logged no %s: optimized_metric can be %s", number, metric, others)
-    return value
-
-
-def _line(row: Mapping[str, object], varied: Sequence[str]) -> str:
-    """Return a row in one line: the settings that differ between the jobs, and what came of them."""
-    settings = " ".join(f"{name}={row[name]}" for name in varied if name in row)
-    value = row["value"]
-    score = f", {row['metric']} = {value:.4g}" if isinstance(value, float) else ""
-    return f"{settings} {row['status']}{score}".strip()
+def _named(jobs: Iterable[Job]) -> str:
+    """Return ``job 3`` or ``jobs 3, 4, 5``."""
+    numbers = [str(job.number) for job in jobs]
+    return f"job{'s' if len(numbers) > 1 else ''} {', '.join(numbers)}"
 
 
 def _gpus() -> list[str]:
@@ -332,8 +246,28 @@ def _limit(parallel: int | str, jobs: Sequence[Job], gpus: Sequence[str]) -> int
     return limit
 
 
+class _Return(JobReturn):
+    """What Hydra gets of a job, without the line that it would write of one that has failed."""
+
+    @property
+    def return_value(self) -> Any:
+        """Return what the job has come to, or raise why it has not.
+
+        Raises:
+            RaytranError: the job failed.
+        """
+        if isinstance(self._return_value, Exception):
+            raise self._return_value
+        return self._return_value
+
+    @return_value.setter
+    def return_value(self, value: Any) -> None:
+        """Take it."""
+        self._return_value = value
+
+
 def _job_return(job: Job, value: float | None) -> JobReturn:
-    returned = JobReturn(
+    returned = _Return(
         overrides=list(job.overrides),
         cfg=OmegaConf.masked_copy(job.config, [str(key) for key in job.config if key != "hydra"]),
         hydra_cfg=OmegaConf.masked_copy(job.config, "hydra"),

@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 from raytran.checkpoints.file import BEST_NAME
 from raytran.checkpoints.network import without_sources
 from raytran.checkpoints.runs import LAST
+from raytran.checkpoints.sweeps import varied_settings
 from raytran.errors import ConfigError
 from raytran.run.path_settings import without_references
 from raytran.run.train.settings import RunConfig, does_compile
@@ -29,8 +30,9 @@ from raytran.training.callbacks.step_progress import LossBar, StepProgress
 from raytran.training.callbacks.telemetry import RunSettings, Telemetry
 from raytran.training.checkpoint_io import AtomicCheckpointIO
 from raytran.training.datamodule import SceneDataModule
+from raytran.training.history import METRICS
 from raytran.training.lightning_module import Reconstruction
-from raytran.training.loggers import METRICS, MetricsTable
+from raytran.training.loggers import MetricsTable
 from raytran.training.ranks import SyncedBatchNorm
 
 if TYPE_CHECKING:
@@ -218,6 +220,10 @@ def _monitors(cfg: DictConfig, folder: Path, settings: dict[str, Any]) -> list[p
         Health(max_skipped=max_skipped),
         Telemetry(),
         LearningRateMonitor(),
-        RunSettings(settings, metric=cfg.get("optimized_metric")),
+        RunSettings(
+            settings,
+            metric=cfg.get("optimized_metric"),
+            first=[*varied_settings(folder), "experiment", "preset", "seed"],
+        ),
     ]
     return [*monitors, ScenePictures(folder / "pictures", scenes=pictures)] if pictures else monitors

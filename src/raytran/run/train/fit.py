@@ -15,8 +15,6 @@ import lightning.pytorch as pl
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
 
 from raytran.checkpoints.file import read_checkpoint, read_newest
 from raytran.checkpoints.load import classes_of, load_weights
@@ -29,9 +27,9 @@ from raytran.run.device import cudnn_warning, set_matmul_precision
 from raytran.run.train.build import build_data, build_model, build_module, build_trainer, plain
 from raytran.run.train.learning_rate import find_learning_rate
 from raytran.run.train.memory import explained_out_of_memory
-from raytran.run.train.parent import find_parent, stages_after
+from raytran.run.train.parent import find_parent, stage_of, stages_after
 from raytran.run.train.rank_processes import rank_processes
-from raytran.run.train.settings import RunConfig
+from raytran.run.train.settings import CONFIG, RunConfig, given_steps
 from raytran.run.train.start_report import changed_settings, start_report
 from raytran.training.callbacks.stage import StageCallback
 from raytran.training.callbacks.stop_signals import StopRequestedError
@@ -42,9 +40,6 @@ if TYPE_CHECKING:
     from raytran.model import RayTran
 
 _log = logging.getLogger(__name__)
-
-CONFIG = "config.yaml"
-"""File with all settings of a run, in its folder."""
 
 _RATE = "optimizer.learning_rate"
 
@@ -172,7 +167,7 @@ def _finished_before(run: RunConfig, folder: Path, *, steps: int) -> FitResult |
         steps: how many it is to take in all, as of Lightning's ``max_steps``.
     """
     # In this order: the first of torchrun's ranks removes the mark before it writes down its own settings.
-    given = _given_steps(folder)
+    given = given_steps(folder)
     finished = read_finished(folder)
     if run.resume == "none":
         if finished is not None or (folder / LAST).is_file():
@@ -192,18 +187,6 @@ def _finished_before(run: RunConfig, folder: Path, *, steps: int) -> FitResult |
     return FitResult(folder, folder / finished.checkpoint, finished.steps, 0.0, {})
 
 
-def _given_steps(folder: Path) -> int | None:
-    """Return how many steps the run in ``folder`` was to take, below 0 for no end, None if it does not say.
-
-    It may have finished with fewer, where its scores got no better.
-    """
-    try:
-        steps = OmegaConf.select(OmegaConf.load(folder / CONFIG), "trainer.max_steps")
-    except (OSError, ValueError, YAMLError, OmegaConfBaseException):
-        return None
-    return steps if isinstance(steps, int) else None
-
-
 class _Start(NamedTuple):
     """Where a fit begins.
 
@@ -220,7 +203,7 @@ class _Start(NamedTuple):
 
 def _start(cfg: DictConfig, run: RunConfig) -> _Start:
     """Return what a resumed or a new run begins with."""
-    stage = _stage(cfg)
+    stage = stage_of(cfg)
     next_stages = stages_after(stage)
     found = _to_continue(run)
     if found is not None:
@@ -283,10 +266,6 @@ def _to_continue(run: RunConfig) -> tuple[Path, dict[str, Any]] | None:
     if found is None:
         _log.info("nothing to continue: this is a new run")
     return found
-
-
-def _stage(cfg: DictConfig) -> Stage:
-    return Stage(**{name: value for name, value in plain(cfg.stage).items() if name != "_target_"})
 
 
 def _describe_run(cfg: DictConfig, folder: Path) -> None:

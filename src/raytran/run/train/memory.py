@@ -21,6 +21,10 @@ _SAVING = {
 """What each setting may become (docs/out-of-memory.md); those that change the result least come first."""
 
 
+TOO_SMALL = "does not suffice for a step"
+"""In what is said then, and in nothing else."""
+
+
 @contextmanager
 def explained_out_of_memory(cfg: DictConfig) -> Iterator[None]:
     """Turn an out-of-memory error inside the block into one that names the settings to change.
@@ -36,7 +40,7 @@ def explained_out_of_memory(cfg: DictConfig) -> Iterator[None]:
             raise
         # The traceback's frames hold the tensors of the failed step: free them first.
         error.__traceback__ = None
-        raise ConfigError(f"{where} does not suffice for a step: change {_advice(cfg)}") from None
+        raise ConfigError(f"{where} {TOO_SMALL}: change {_advice(cfg)}") from None
 
 
 def _place(error: BaseException) -> str | None:

@@ -7,7 +7,7 @@ import logging
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from raytran.checkpoints.file import checkpoint_path, read_checkpoint
 from raytran.checkpoints.metadata import DataIdentity
@@ -65,6 +65,12 @@ def _no_parent(run: RunConfig, stage: Stage, data: DataIdentity, *, number_of_ot
         return f"{runs}: run {first}` first, {otherwise}"
     others, first = f"{number_of_others} on others", f"{first} {data.typed()}"
     return f"{runs} is on these data, {others}: run {first}` first, {otherwise}"
+
+
+def stage_of(cfg: DictConfig) -> Stage:
+    """Return the stage that a config is of."""
+    settings: Any = OmegaConf.to_container(cfg.stage, resolve=True)
+    return Stage(**{name: value for name, value in settings.items() if name != "_target_"})
 
 
 def stages_after(stage: Stage) -> list[Stage]:

@@ -1,17 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The switches that people type, with their types."""
+"""The switches that people type, with their types, and what a run was given."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from raytran.checkpoints.network import trusted_packages
 from raytran.errors import ConfigError
 from raytran.run.device import check_matmul_precision
+
+CONFIG = "config.yaml"
+"""File with all settings of a run, in its folder."""
 
 PROGRESS_BARS = ("rich", "tqdm", "none")
 PARENT_CHECKS = ("scores", "stage", "none")
@@ -93,3 +98,15 @@ class RunConfig:
             raise ConfigError(f"checkpoint_every must be at least 1, got {typed.checkpoint_every}")
         trusted_packages(typed.trust)
         return typed
+
+
+def given_steps(folder: Path) -> int | None:
+    """Return how many steps the run in ``folder`` was to take, below 0 for no end, None if it does not say.
+
+    It may have finished with fewer, where its scores got no better.
+    """
+    try:
+        steps = OmegaConf.select(OmegaConf.load(folder / CONFIG), "trainer.max_steps")
+    except (OSError, ValueError, YAMLError, OmegaConfBaseException):
+        return None
+    return steps if isinstance(steps, int) else None

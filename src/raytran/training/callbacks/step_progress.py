@@ -8,16 +8,9 @@ from typing import Any
 
 import lightning.pytorch as pl
 from lightning.pytorch.callbacks import TQDMProgressBar
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from raytran.training.live_bar import LiveBar, is_terminal
 from raytran.training.loggers import was_logged_step
 
 _log = logging.getLogger(__name__)
@@ -51,14 +44,14 @@ class StepProgress(pl.Callback):
 
     def __init__(self, title: str) -> None:
         self._title = title
-        self._bar: Progress | None = None
+        self._bar: LiveBar | None = None
         self._task: Any = None
         self._shown_at = 0
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Draw the bar."""
         self._shown_at = trainer.global_step
-        if not trainer.is_global_zero or not Console().is_terminal:
+        if not trainer.is_global_zero or not is_terminal():
             return
         columns = (
             TimeElapsedColumn(),
@@ -66,7 +59,7 @@ class StepProgress(pl.Callback):
             TimeRemainingColumn(),
             TextColumn("{task.fields[loss]}"),
         )
-        self._bar = Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *columns)
+        self._bar = LiveBar(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), *columns)
         self._task = self._bar.add_task(
             self._title, total=_total(trainer), completed=trainer.global_step, loss=""
         )
@@ -88,6 +81,15 @@ class StepProgress(pl.Callback):
 
     def teardown(self, trainer: pl.Trainer, pl_module: pl.LightningModule, stage: str) -> None:
         """Leave the finished bar on the screen."""
+        self._stop()
+
+    def on_exception(
+        self, trainer: pl.Trainer, pl_module: pl.LightningModule, exception: BaseException
+    ) -> None:
+        """Leave the bar as it is: Lightning then tears no callback down, and the cursor would stay hidden."""
+        self._stop()
+
+    def _stop(self) -> None:
         if self._bar is not None:
             self._bar.stop()
             self._bar = None

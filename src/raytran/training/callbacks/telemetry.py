@@ -6,7 +6,7 @@ from __future__ import annotations
 import resource
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import lightning.pytorch as pl
@@ -84,17 +84,20 @@ class Telemetry(pl.Callback):
 class RunSettings(pl.Callback):
     """Hands a run's settings to its loggers, and at the end the score that runs are compared by.
 
-    TensorBoard's table of settings (HPARAMS) needs both at once, so it gets the settings with the score.
+    TensorBoard's table of settings (HPARAMS) needs both at once, so it gets the settings with the score. Its
+    columns come in the order of the settings: those first in which runs differ.
 
     Args:
         settings: of the run, plain Python.
         metric: name of a logged value, e.g. ``val/objects/accuracy_class``, whose last one is the
             score; None for no score.
+        first: names of settings whose columns come first, e.g. ``optimizer.learning_rate``.
     """
 
-    def __init__(self, settings: Mapping[str, Any], *, metric: str | None) -> None:
+    def __init__(self, settings: Mapping[str, Any], *, metric: str | None, first: Sequence[str] = ()) -> None:
         self._settings = dict(settings)
         self._metric = metric
+        self._first = [name.replace("/", ".") for name in first]
 
     def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Log the settings."""
@@ -108,8 +111,22 @@ class RunSettings(pl.Callback):
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
                 scores = {} if score is None else {HP_METRIC: float(score)}
-                logger.log_hyperparams(self._settings, scores, step=trainer.global_step)
+                logger.log_hyperparams(self._columns(), scores, step=trainer.global_step)
             elif isinstance(logger, WandbLogger) and score is not None:
                 logger.experiment.summary[HP_METRIC] = float(score)
             elif isinstance(logger, MLFlowLogger) and score is not None:
                 logger.log_metrics({HP_METRIC: float(score)}, trainer.global_step)
+
+    def _columns(self) -> dict[str, Any]:
+        """Return the settings by dotted name, without those that say which class is built."""
+        leaves = dict(_leaves(self._settings))
+        ordered = [name for first in self._first for name in leaves if f"{name}.".startswith(f"{first}.")]
+        return {name: leaves[name] for name in [*ordered, *leaves]}
+
+
+def _leaves(node: Mapping[str, Any], path: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in node.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{path}{name}.")
+        elif name != "_target_":
+            yield f"{path}{name}", value
