@@ -34,6 +34,7 @@ GIVEN_BY_CODE = {
     },
     "raytran.rooms.ensure.ensure_rooms": {"output"},
     "raytran.rooms.ensure.ensure_rooms_v1": {"output"},
+    "raytran.rooms.ensure.ensure_rooms_v2": {"output"},
 }
 WITHOUT_ARGUMENTS = {
     "raytran.extensions.proposal_queries.ProposalLoss",

@@ -149,7 +149,7 @@ def compare_ranks(
 def _settings(context: Context, folder: Path) -> list[str]:
     """Return what all runs share."""
     rooms = f"data.root={quoted(folder / 'rooms')}"
-    common = ["preset=tiny", rooms, "progress_bar=none", "watch.pictures=0"]
+    common = ["preset=tiny", rooms, "rooms.make=true", "progress_bar=none", "watch.pictures=0"]
     return [*common, *context.device.command, *context.sizes.training]
 
 

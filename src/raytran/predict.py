@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING
 
 from raytran.run.entry import entry_point
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
 @entry_point("predict")
 def main(cfg: DictConfig) -> None:
     """Run the command."""
+    logging.getLogger(__name__).info("predicting %s: loading the network …", cfg.scene)
+
     # Imported here so that --help answers at once.
     from raytran.run.predict.predict import predict
 

@@ -91,6 +91,11 @@ _NUMBERS: dict[str, Quantity] = {
 _MAX_DEPTH = 50
 
 
+def is_a_number(name: str) -> bool:
+    """Return whether a setting of this name is a number in every command."""
+    return name in _COUNTS or name in _NUMBERS
+
+
 def check_settings(settings: Mapping[str, Any], *, where: str = "") -> None:
     """Raise unless every number in settings lies within the bounds of what it means.
 

@@ -16,8 +16,9 @@ def main(cfg: DictConfig) -> None:
     """Run the command."""
     # Imported here so that --help answers at once.
     from raytran.run.train.fit import train
+    from raytran.run.train.next_command import tell_after_stage
 
-    train(cfg)
+    tell_after_stage(cfg, train(cfg))
 
 
 if __name__ == "__main__":

@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-import sys
 from typing import TYPE_CHECKING
 
-from raytran.run.entry import entry_point, name_positional
+from raytran.run.entry import entry_point
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -22,5 +21,4 @@ def main(cfg: DictConfig) -> None:
 
 
 if __name__ == "__main__":
-    sys.argv[1:] = name_positional(sys.argv[1:], "folder")
     main()

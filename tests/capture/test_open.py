@@ -114,6 +114,9 @@ def test_what_is_not_there_or_unknown(walk, tmp_path):
             open_scene(tmp_path / name)
     with pytest.raises(DataError, match="has images without poses: let COLMAP or a phone's ARKit find them"):
         open_scene(walk.folder)
+    (tmp_path / "0.JPG").touch()
+    with pytest.raises(DataError, match=r"0\.JPG is one image: give the folder with all frames"):
+        open_scene(tmp_path / "0.JPG")
     (tmp_path / "notes.doc").write_text("")
     with pytest.raises(DataError, match=r"notes\.doc is in none of the formats scannet, "):
         open_scene(tmp_path / "notes.doc")
@@ -134,6 +137,11 @@ def test_what_is_not_there_or_unknown(walk, tmp_path):
         (["odometry.csv", "depth/0.png"], r"has Stray Scanner's odometry\.csv but no rgb\.mp4"),
         (["keyframes/depth/1.png"], "has Polycam's keyframes without cameras/ and images/"),
         (["images/0.jpg", "database.db"], "has parts of a COLMAP project but no model"),
+        (["images/0.jpg", "sparse/0/cameras.txt"], "has parts of a COLMAP project but no model"),
+        (
+            ["color/0.jpg", "intrinsic/a.txt"],
+            r"has ScanNet's color/ and intrinsic/ but no pose/: wanted is a 4x4 matrix",
+        ),
         (["a.mp4", "b.mp4"], "holds 2 videos: give the path of one of them"),
         (["._a.mp4", ".DS_Store"], "is empty"),
     ],

@@ -15,11 +15,12 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
 from omegaconf import OmegaConf
 
+from raytran.__main__ import VERBS
 from raytran.run.config_dir import config_dir
-from raytran.run.entry import entry_point, name_positional
+from raytran.run.entry import entry_point, with_keys
 
-COMMAND = re.compile(r"-m raytran\.(\w+)((?:\\\n|[^\n`])*)")
-POSITIONAL = {"view": {"key": "folder"}}
+COMMAND = re.compile(rf"(?:-m raytran\.|\braytran +(?=(?:{'|'.join(VERBS)})\b))(\w+)((?:\\\n|[^\n`])*)")
+POSITIONAL = ("view",)
 
 
 def commands(text):
@@ -28,11 +29,18 @@ def commands(text):
         rest = re.sub(r"\\\n\s*", "", rest).replace("\\|", "|")
         rest = re.split(r"\s#|\s{3,}|[;)](?=\s|$)", rest)[0].rstrip(" ,.:")
         rest = re.sub(r"(^|\s)\[([\w./]+=.*?)\](?=\s|$)", r"\1\2", rest)  # [key=value]: may be left out
-        words = [word.rstrip(",") for word in shlex.split(rest) if not re.match(r"-|…|.*=…$", word)]
-        if name not in POSITIONAL:
-            words = list(takewhile(lambda word: "=" in word, words))  # what follows is prose
+        words = [word.rstrip(",") for word in split(rest) if not re.match(r"-|…|.*=…$", word)]
+        path = words[:1] if name in POSITIONAL else []
+        words = path + list(takewhile(lambda word: "=" in word, words[len(path) :]))  # what follows is prose
         words = [word.replace("…", "x") for word in words]
         yield from ((name, tuple(choice)) for choice in product(*map(alternatives, words)))
+
+
+def split(text):
+    try:
+        return shlex.split(text)
+    except ValueError:  # an apostrophe in prose
+        return text.split()
 
 
 def alternatives(word):
@@ -59,11 +67,13 @@ def settings(name, *chosen):
 
 def complaint(name, words):
     """Return what is wrong with a command, None if nothing is."""
+    if name == "VERB":
+        return None  # stands for any
     if find_spec(f"raytran.{name}") is None:
         return "there is no such command"
     if not (config_dir() / f"{name}.yaml").is_file():
         return None  # one without Hydra reads its words itself
-    words = name_positional(words, **POSITIONAL[name]) if name in POSITIONAL else list(words)
+    words = with_keys(name, words) if name in POSITIONAL else list(words)
     try:
         overrides = OverridesParser.create().parse_overrides(words)
     except OverrideParseException as error:
@@ -115,6 +125,8 @@ def test_every_command_has_its_page(project_root):
     ("text", "found"),
     [
         ("`python -m raytran.train seed=1`, and", [("train", ("seed=1",))]),
+        ("raytran train seed=1    all else; raytran carries", [("train", ("seed=1",))]),
+        ("raytran predict walk.mp4 of raytran's", [("predict", ())]),
         ("python -m raytran.view PREDICTION   # in the browser", [("view", ("PREDICTION",))]),
         (
             "-m raytran.evaluate a=x|y \\\n  [b=c]",
@@ -147,8 +159,10 @@ def test_rows_of_the_paper_name_their_data(pages, project_root):
     """A command that names none runs on generated rooms, whatever the checkpoint was trained on."""
     page = pages[project_root / "docs" / "experiments.md"]
     table = page.split("## The paper's tables")[1].split("## Sweeps")[0]
-    rows = [line for line in table.splitlines() if line.startswith("|") and "-m raytran." in line]
-    found = [command for row in rows for command in re.findall(r"`(python -m raytran\.[^`]*)`", row)]
+    rows = [line for line in table.splitlines() if line.startswith("|") and COMMAND.search(line)]
+    found = [
+        command for row in rows for command in re.findall(r"`((?:python -m raytran\.|raytran )[^`]*)`", row)
+    ]
     assert len(found) >= 5
     silent = [command for command in found if "data=scan2cad data.root=DIR" not in command]
     assert not silent, silent

@@ -8,6 +8,7 @@ import sys
 
 import pytest
 
+from raytran.run.conf_comments import header, options
 from raytran.run.config_dir import config_dir
 
 
@@ -30,7 +31,7 @@ def test_pages_say_what_conf_says(tables):
 def test_every_setting_of_a_command_is_explained(tables, root):
     shown = "".join(page.read_text(encoding="utf-8") for page in tables.pages())
     assert f"<!-- options: {root} -->" in shown, f"no page of docs has the settings of {root}"
-    silent = [option.name for option in tables.options(root) if not option.comment]
+    silent = [option.name for option in options(root) if not option.comment]
     assert not silent, f"conf/{root}.yaml says nothing about {', '.join(silent)}"
 
 
@@ -56,4 +57,4 @@ def test_a_table_follows_its_file(tables, tmp_path, monkeypatch):
         "after",
     ]
     assert tables.filled(tables.filled(page)) == tables.filled(page)
-    assert tables.header(tmp_path / "data" / "x.yaml") == "Head"
+    assert header(tmp_path / "data" / "x.yaml") == "Head"

@@ -6,6 +6,7 @@ import logging
 
 import pytest
 
+from raytran.errors import ConfigError
 from raytran.rooms import ensure as rooms
 from raytran.rooms.ensure import ensure_rooms, ensure_rooms_v1
 from raytran.run.entry import compose
@@ -34,6 +35,37 @@ def write_set(folder, scans, present):
 def test_rooms_are_made_on_first_use(tmp_path, made):
     ensure_rooms(tmp_path / "rooms", num_train=2, num_val=1)
     assert made == [{"num_train": 2, "num_val": 1}]
+
+
+def test_elsewhere_rooms_are_asked_for(tmp_path, made):
+    (tmp_path / "rooms-mine").mkdir()
+    (tmp_path / "rooms-mine" / "rooms.json").write_text("{}")
+    asked = {"num_train": 2, "num_val": 1, "usual": tmp_path / "usual"}
+    with pytest.raises(ConfigError) as refused:
+        ensure_rooms(tmp_path / "room-mine", allowed="auto", **asked)
+    assert str(refused.value) == (
+        f"there are no rooms in data.root={tmp_path / 'room-mine'}: is {tmp_path / 'rooms-mine'} meant? "
+        "rooms.make=true makes 3 of them there"
+    )
+    with pytest.raises(ConfigError, match=r"rooms.make=true makes 3"):
+        ensure_rooms(tmp_path / "usual", allowed=False, **asked)
+    with pytest.raises(ConfigError, match=r"unknown rooms\.make=perhaps"):
+        ensure_rooms(tmp_path / "usual", allowed="perhaps", **asked)
+    assert made == []
+    for folder, allowed in (("rooms-mine", "auto"), ("usual", "auto"), ("elsewhere", True)):
+        ensure_rooms(tmp_path / folder, allowed=allowed, **asked)
+    assert made == [{"num_train": 2, "num_val": 1}] * 3
+
+
+def test_training_asks_for_rooms_in_another_folder_than_its_own(made, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    build_data(compose("train", ["preset=tiny", "output_dir=x"])).prepare_data()
+    assert len(made) == 1
+    words = ["preset=tiny", "output_dir=x", "data.root=nope"]
+    with pytest.raises(ConfigError, match=r"there are no rooms in data\.root=nope"):
+        build_data(compose("train", words)).prepare_data()
+    build_data(compose("train", [*words, "rooms.make=true"])).prepare_data()
+    assert len(made) == 2
 
 
 def test_a_whole_set_is_used_as_it_is(tmp_path, made, caplog):
@@ -67,7 +99,14 @@ def test_a_whole_benchmark_is_used_and_a_smaller_one_is_completed(tmp_path, made
 
 def test_the_benchmark_as_training_data(made, tmp_path):
     cfg = compose(
-        "train", ["data=rooms-v1", f"data.root={tmp_path}", "data.make.num_train=7", "output_dir=x"]
+        "train",
+        [
+            "data=rooms-v1",
+            f"data.root={tmp_path}",
+            "data.make.num_train=7",
+            "rooms.make=true",
+            "output_dir=x",
+        ],
     )
     data = build_data(cfg)
     data.prepare_data()

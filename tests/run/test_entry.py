@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import subprocess
 import sys
 
@@ -10,8 +11,10 @@ import pytest
 from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 
-from raytran.errors import DataError
-from raytran.run.entry import compose, name_positional, run_or_exit, with_number_lists
+from raytran.checkpoints.runs import one_at_a_time
+from raytran.errors import ConfigError, DataError
+from raytran.run.entry import compose, run_or_exit, with_keys, with_number_lists
+from raytran.run.refused_run import remove_refused_run
 
 
 def raise_error(error):
@@ -100,12 +103,23 @@ def test_a_defect_keeps_its_traceback():
     ("typed", "said"),
     [
         ("learning_speed=3", "learning_speed"),
-        ("model=tinny", "Could not find 'model/tinny': choose one of laptop, raytran, small, tiny"),
+        (
+            "model=tinny",
+            "there is no model=tinny: is model=tiny meant? choose one of laptop, raytran, small, tiny",
+        ),
         ("cache_dir=x", "there is no setting cache_dir: is data.dataset.cache_dir meant?"),
         ("data.cache_dir=x", "is data.dataset.cache_dir meant?"),
         ("trainer.maxsteps=3", "is trainer.max_steps meant?"),
-        ("nothing.like.it=3", "there is no setting nothing.like.it: --cfg job lists all"),
+        ("nothing.like.it=3", "there is no setting nothing.like.it: --help lists all"),
         ("seed", "key=value"),
+        ("expriment=stage1", "is experiment meant?"),
+        ("--seed=3", "there is no option --seed: settings are written without dashes, as seed=VALUE"),
+        ("seed=abc", "seed=abc is no number: give one, as in seed=0"),
+        ("views.num_views=abc", "views.num_views=abc is no number: give one, as in views.num_views=20"),
+        ("lr_find=perhaps", "lr_find=perhaps is neither true nor false"),
+        ("progress_bar=fancy", "unknown progress_bar=fancy"),
+        ("experiment=stage2", "no finished run of stage1"),
+        ("trainer=gpu", "trainer.accelerator=gpu trainer.devices=1 asks for a GPU, and torch"),
         ("resume=elsewhere.ckpt", "give resume=auto"),
         ("schedule.joint.steps=3", "schedule.joint.steps=3 is called schedule.stage2.steps=3 now"),
         ("model.backbone.resnet.width=8", "is called model.backbone.encoder.width=8 now"),
@@ -132,8 +146,9 @@ def test_help_names_the_settings_without_loading_torch(name, tmp_path):
         [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    assert f"python -m raytran.{name}" in done.stdout
+    assert re.search(rf"raytran[ .]{name}\b", done.stdout)
     assert "preset" in done.stdout
+    assert "_target_" not in done.stdout
 
 
 def test_compose_is_what_the_command_line_would_compose():
@@ -142,15 +157,76 @@ def test_compose_is_what_the_command_line_would_compose():
 
 
 @pytest.mark.parametrize(
-    ("typed", "meant"),
+    ("name", "typed", "meant"),
     [
-        (["a/b.pt", "device=cpu"], ['file="a/b.pt"', "device=cpu"]),
-        (["--cfg", "job", "x y"], ["--cfg", "job", 'file="x y"']),
-        (["file=z.pt", "--help"], ["file=z.pt", "--help"]),
+        ("predict", ["a/b.mp4", "device=cpu"], ['scene="a/b.mp4"', "device=cpu"]),
+        ("view", ["--cfg", "job", "x y"], ["--cfg", "job", 'folder="x y"']),
+        ("view", ["folder=z", "--help"], ["folder=z", "--help"]),
+        ("prepare", ["mine"], ['check="mine"']),
+        ("evaluate", ["run/last.ckpt"], ['checkpoint="run/last.ckpt"']),
+        ("evaluate", ["default"], ['checkpoint="default"']),
+        ("evaluate", ["theirs", "annotations=a.json"], ['predictions="theirs"', "annotations=a.json"]),
+        ("export_model", ["last.ckpt"], ['checkpoint="last.ckpt"']),
+        ("train", ["walk.mp4"], ["walk.mp4"]),
     ],
 )
-def test_words_without_a_key_get_one(typed, meant):
-    assert name_positional(typed, "file") == meant
+def test_a_path_without_a_key_gets_one(name, typed, meant):
+    assert with_keys(name, typed) == meant
+
+
+@pytest.mark.parametrize("words", [["a", "b"], ["a", "scene=b"], ["scene=b", "a"]])
+def test_two_paths_without_a_key_are_not_guessed(words):
+    with pytest.raises(ConfigError, match="is a path without a name, and scene= is there already"):
+        with_keys("predict", words)
+
+
+@pytest.mark.parametrize(
+    ("name", "typed", "said"),
+    [
+        ("predict", [], "predict needs scene=, for example: "),
+        ("predict", ["x", "num_views=many"], "num_views=many is no number: give one, or leave it out"),
+        ("predict", ["x", "viewer=maybe"], "viewer=maybe is neither true nor false"),
+        ("predict", ["nowhere.mp4"], "there is no scene "),
+        ("view", [], "view needs folder=, for example: "),
+    ],
+)
+def test_what_is_missing_or_of_another_kind_names_its_setting(name, typed, said, tmp_path, command):
+    done = command(name, *typed, folder=tmp_path)
+    assert done.returncode == 1
+    (sentence,) = done.stderr.splitlines()
+    assert sentence.startswith(f"raytran: {said}")
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+def test_a_refused_run_leaves_what_was_there(tmp_path, command):
+    (tmp_path / "run" / "checkpoints").mkdir(parents=True)
+    (tmp_path / "run" / "checkpoints" / "last.ckpt").write_bytes(b"mine")
+    (tmp_path / "outputs" / "else").mkdir(parents=True)
+    for words in (["output_dir=run"], ["precision=fp16"]):
+        done = command("train", "preset=tiny", *words, folder=tmp_path)
+        assert done.returncode == 1
+    assert (tmp_path / "run" / "checkpoints" / "last.ckpt").read_bytes() == b"mine"
+    assert sorted(path.name for path in (tmp_path / "outputs").iterdir()) == ["else"]
+
+
+def test_a_run_that_another_process_trains_in_is_left_alone(tmp_path):
+    (tmp_path / "runs" / "a").mkdir(parents=True)
+    (tmp_path / "runs" / "a" / "train.log").touch()
+    with one_at_a_time(tmp_path / "runs" / "a"):
+        subprocess.run(
+            [sys.executable, "-c", REMOVE, str(tmp_path / "runs" / "a"), str(tmp_path / "runs")], check=True
+        )
+        assert (tmp_path / "runs" / "a" / "train.log").exists()
+    remove_refused_run(tmp_path / "runs" / "a", outputs=tmp_path / "runs")
+    assert not (tmp_path / "runs").exists()
+
+
+REMOVE = """
+import sys
+from pathlib import Path
+from raytran.run.refused_run import remove_refused_run
+remove_refused_run(Path(sys.argv[1]), outputs=Path(sys.argv[2]))
+"""
 
 
 @pytest.mark.parametrize(

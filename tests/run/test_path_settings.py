@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 
 from raytran.errors import ConfigError
 from raytran.run.config_dir import config_dir
-from raytran.run.entry import compose, name_positional
+from raytran.run.entry import compose, with_keys
 from raytran.run.path_settings import PATH_SETTINGS, check_run_folder, literal_paths, quoted
 from raytran.run.train.build import build_data
 
@@ -214,7 +214,7 @@ def test_what_is_in_quotes_is_hydras(typed, meant):
         ("predict", "truth=NULL", True),
         ("predict", "scene=null", False),
         ("prepare", "output=null", True),
-        ("predict", "output=null", False),
+        ("predict", "output=null", True),
         ("evaluate", "predictions=null", True),
         ("train", "data.make.cads=null", True),
         ("train", "model.backbone.encoder.weights=null", True),
@@ -291,8 +291,8 @@ def test_a_run_cannot_be_kept_where_hydra_reads_a_reference(word):
 def test_a_word_without_a_key_may_have_an_equals_sign(tmp_path, monkeypatch):
     (tmp_path / "a=b").mkdir()
     monkeypatch.chdir(tmp_path)
-    assert name_positional(["a=b", "port=0"], "folder") == ['folder="a=b"', "port=0"]
-    assert name_positional(["/x/a=b", "./a=b", "部=屋"], "folder") == [
+    assert with_keys("view", ["a=b", "port=0"]) == ['folder="a=b"', "port=0"]
+    assert [with_keys("view", [word])[0] for word in ("/x/a=b", "./a=b", "部=屋")] == [
         'folder="/x/a=b"',
         'folder="./a=b"',
         'folder="部=屋"',

@@ -20,6 +20,7 @@ from raytran.capture.recording import Intrinsics, RecordedScan, Recording, open_
 from raytran.capture.stray import find_odometry, open_stray, read_stray
 from raytran.capture.trajectory import find_images, find_track, is_tum, read_tum
 from raytran.capture.video import VIDEO_ENDINGS, find_video, open_video, read_video
+from raytran.data.images import IMAGE_ENDINGS
 from raytran.data.scan import OpenScan
 from raytran.data.scannet.layout import Listing, recognise
 from raytran.data.scannet.scan import open_scan
@@ -193,6 +194,8 @@ def _is_aligned(path: Path) -> bool:
 
 def _unknown(path: Path) -> DataError:
     """Return the error for a scene in no format: what it nearly is and what it lacks, or what is read."""
+    if path.suffix.lower() in IMAGE_ENDINGS:
+        return DataError(f"{path} is one image: give the folder with all frames of the walk and their poses")
     if path.is_file():
         return DataError(
             f"{path} is in none of the formats {', '.join(FORMATS[1:])}: give a folder or a video"
@@ -232,8 +235,15 @@ def _lacking(path: Path, listing: Listing) -> str | None:
         return "has Stray Scanner's odometry.csv but no rgb.mp4 or rgb/: copy the whole recording"
     if "keyframes" in listing.folders:
         return "has Polycam's keyframes without cameras/ and images/ in it: export it as raw data"
+    below = {file.stem for file in path.glob("sparse/**/*") if file.suffix in (".bin", ".txt")}
+    models |= {"cameras", "images", "points3D"} & below
     if {"database.db"} & listing.files or (len(models) == 1 and models != {"images"}):
         return "has parts of a COLMAP project but no model: wanted are cameras and images, .bin or .txt"
+    if {"color", "intrinsic"} <= listing.folders and "pose" not in listing.folders:
+        return (
+            "has ScanNet's color/ and intrinsic/ but no pose/: wanted is a 4x4 matrix in pose/0.txt for "
+            "color/0.jpg"
+        )
     return None
 
 

@@ -30,7 +30,7 @@ _NAMES = {
 }
 """What makes a data set → its name, for checkpoints from before configs named it; it lay in ``run`` once."""
 
-_HOW = ("_target_", "_partial_", "processes", "progress")
+_HOW = ("_target_", "_partial_", "processes", "progress", "allowed", "usual")
 """Settings of what makes a data set that change nothing in it."""
 
 

@@ -30,6 +30,16 @@ def choose_device(name: str) -> torch.device:
     return device
 
 
+def device_name(device: torch.device) -> str:
+    """Return how to call a device in the log: ``the CPU (2 threads)``, or ``cuda:0 (NVIDIA H200)``."""
+    if device.type == "cuda":
+        return f"{device} ({torch.cuda.get_device_name(device)})"
+    if device.type == "cpu":
+        threads = torch.get_num_threads()
+        return f"the CPU ({threads} thread{'s' if threads != 1 else ''})"
+    return str(device)
+
+
 def check_matmul_precision(name: str) -> None:
     """Do nothing for a precision that exists.
 

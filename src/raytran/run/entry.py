@@ -8,74 +8,54 @@ import functools
 import io
 import os
 import re
-import shlex
+import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from argparse import Namespace
+from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import (
     ConfigCompositionException,
     InstantiationException,
-    MissingConfigException,
     OverrideParseException,
 )
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
-from raytran.checkpoints.runs import STAGE_NAMES, first_ranks, run_folder
+from raytran.checkpoints.runs import first_ranks, run_folder
 from raytran.data.files import disk_full
 from raytran.data.workers import ENDS_WITH, end_with_parent
 from raytran.errors import ConfigError, DataError, RaytranError
+from raytran.run.closed_pipe import survive_closed_pipe
 from raytran.run.config_dir import config_dir
-from raytran.run.path_settings import check_run_folder, literal_paths, quoted
+from raytran.run.help_page import help_page
+from raytran.run.path_settings import check_run_folder, key_of_path, literal_paths, quoted
+from raytran.run.refused_run import remove_refused_run
+from raytran.run.setting_mistakes import (
+    KEY,
+    check_kinds,
+    first_line,
+    missing_setting,
+    no_such_setting,
+    unreadable_setting,
+)
 from raytran.run.sweep.folder import register_sweep_resolver
 from raytran.setting_limits import check_settings
 
 _FULL_ERROR = "HYDRA_FULL_ERROR"
 """Hydra's own switch: with it set to 1, errors are shown at length."""
 
-_RENAMED = (
-    (r"experiment=(gt_masks|unprojection)_(\w+)", r"variant=\1 experiment=\2"),
-    (r"experiment=frames_(\d+)", r"num_views=\1"),
-    (r"experiment=objects_(\d+)", r"max_objects=\1"),
-    (r"model\.backbone\.resnet\.", "model.backbone.encoder."),
-    (r"model\.backbone\.norm_momentum=", "norm_momentum="),
-    (r"model\.backbone\.start_levels=0", "model.backbone.voxel_network=null"),
-    (r"model\.heads\.objects\.windowed=false", "model.heads.objects.voxel_attention=null"),
-    (r"model\.heads\.objects\.refines=center", "model.heads.objects.refinement=null"),
-    (r"model\.backbone\.start_levels=.*", "model/extensions=[unet3d]"),
-    (r"model\.heads\.objects\.windowed=.*", "model/extensions=[windowed_attention]"),
-    (r"model\.heads\.objects\.refines=.*", "model/extensions=[box_refinement]"),
-    (r"model\.heads\.objects\.num_copies=.*", "model/extensions=[denoising]"),
-    (r"model=unprojection", "model/backbone=unprojection"),
-    (r"model/encoder=raytran", "model/encoder=resnet18"),
-    (r"model/encoder=(tiny|small)", r"model/encoder=resnet18_\1"),
-    (r"model/encoder=laptop", "model/encoder=efficientnet_lite0_laptop"),
-    *((rf"(stage=|schedule\.){old}\b", rf"\g<1>{new}") for old, new in STAGE_NAMES.items()),
-)
-"""Settings of earlier versions as they were typed, and as they are typed now."""
-
-_KEY = re.compile(r"[+~]{0,2}[A-Za-z_][\w./@:-]*")
-
-_SEVERAL_VALUES = re.compile(r"Ambiguous value for argument '(.*)'$", re.DOTALL)
-"""How Hydra begins to say that a comma makes a sweep of a single run."""
-
 _REFUSALS = {
     *(errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP, errno.EACCES, errno.EPERM),
     *(errno.EIO, errno.ESTALE, errno.EINVAL, errno.EILSEQ),
 }
 """Numbers of errors by which a system says that a path will not do."""
-
-_UNKNOWN = re.compile(r"Could not override '(.*)'$")
-"""How Hydra begins to say that there is no such setting."""
-
-_MOST_SUGGESTIONS = 3
 
 _KEEP_A_LOG = ("train", "curriculum")
 """Commands for which Hydra writes files of its own into the folder of the run."""
@@ -120,7 +100,12 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
             if "output_dir" in cfg:
                 # Lightning starts further ranks with hydra.run.dir of the first: all share one folder.
                 cfg.output_dir = HydraConfig.get().runtime.output_dir
-            return run_or_exit(function, cfg)
+            try:
+                return run_or_exit(function, cfg, command=config_name)
+            except (SystemExit, RaytranError) as end:
+                if config_name in _KEEP_A_LOG and getattr(end, "code", 1) == 1:
+                    remove_refused_run(Path(cfg.output_dir), outputs=Path(cfg.outputs))
+                raise
 
         try:
             main = hydra.main(version_base="1.3", config_path=str(config_dir()), config_name=config_name)
@@ -146,21 +131,26 @@ def _compose_or_exit(name: str, command: Callable[[], Any], typed: str | None) -
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # a file's name need not be text
+    survive_closed_pipe()
     _end_with_starter()
     _set_full_error("1")  # Hydra then raises instead of printing; the task restores what the user has set
-    sys.argv[1:] = with_number_lists(sys.argv[1:])
+    words = with_number_lists(sys.argv[1:])
     try:
+        typed_options = _options(words)
+        words = with_keys(name, words)
         if name in _KEEP_A_LOG:
-            check_run_folder(sys.argv[1:])
+            check_run_folder(words)
         # Lightning starts further ranks with the words that it finds there.
-        sys.argv[1:] = literal_paths(name, _options_first(sys.argv[1:]))
+        sys.argv[1:] = literal_paths(name, _options_first(words))
+        if typed_options.help:
+            return _write_help(name, typed_options)
         return command()
     except ConfigCompositionException as error:
         _set_full_error(typed)
-        _exit_with(_no_such_setting(name, error, sys.argv[1:]))
+        _exit_with(no_such_setting(error, sys.argv[1:], known=lambda: compose(name, [])))
     except OverrideParseException as error:
         _set_full_error(typed)
-        _exit_with(_unreadable_setting(error))
+        _exit_with(unreadable_setting(error))
     except RaytranError as error:  # of a sweep; those of a single run do not come so far
         _set_full_error(typed)
         _exit_with(error)
@@ -169,7 +159,7 @@ def _compose_or_exit(name: str, command: Callable[[], Any], typed: str | None) -
         if not str(error).startswith("Unknown plugin class"):
             raise
         extras = "'raytran[sweep]' brings Optuna's sweeper, 'raytran[cluster]' the launcher for SLURM"
-        _exit_with(ConfigError(f"{_first_line(error)}: it is not installed; pip install {extras}"))
+        _exit_with(ConfigError(f"{first_line(error)}: it is not installed; pip install {extras}"))
     except OSError as error:
         _set_full_error(typed)
         _exit_if_refused(error)
@@ -178,7 +168,36 @@ def _compose_or_exit(name: str, command: Callable[[], Any], typed: str | None) -
         _set_full_error(typed)
         _exit_if_refused(error)
         # A resolver of ours that objects is wrapped by OmegaConf; its message is the clearer one.
-        _exit_with(ConfigError(_first_line(error).split("resolving interpolation: ")[-1]))
+        _exit_with(ConfigError(first_line(error).split("resolving interpolation: ")[-1]))
+
+
+def _options(words: Sequence[str]) -> Namespace:
+    """Return which of Hydra's options are typed.
+
+    Raises:
+        ConfigError: something is typed like an option, and is none.
+    """
+    found, unknown = get_args_parser().parse_known_args(_options_first(words))
+    if unknown:
+        name = unknown[0].partition("=")[0]
+        raise ConfigError(
+            f"there is no option {name}: settings are written without dashes, as {name.lstrip('-')}=VALUE "
+            "(--help lists them)"
+        )
+    return found
+
+
+def _write_help(name: str, options: Namespace) -> None:
+    """Print what a command can be told, with the values that it has by what is typed beside ``--help``."""
+    settings = literal_paths(name, with_keys(name, options.overrides))
+    folder = (
+        options.config_dir and f"hydra.searchpath=[{quoted(Path(options.config_dir).absolute().as_uri())}]"
+    )
+    with hydra.initialize_config_dir(str(config_dir()), version_base="1.3"):
+        cfg = hydra.compose(
+            name, overrides=[*settings, *([folder] if folder else [])], return_hydra_config=True
+        )
+    sys.stdout.write(help_page(name, cfg, width=shutil.get_terminal_size().columns))
 
 
 def _end_with_starter() -> None:
@@ -200,72 +219,6 @@ def _options_first(words: Sequence[str]) -> list[str]:
         (options if word.startswith("-") or is_value else settings).append(word)
         before = word
     return [*options, *settings]
-
-
-def _no_such_setting(name: str, error: ConfigCompositionException, typed: Sequence[str]) -> ConfigError:
-    """Return what to say of settings that Hydra does not know; of those it knew once, what they are now."""
-    for word in typed:
-        for pattern, now in _RENAMED:
-            if re.match(pattern, word):
-                return ConfigError(f"{word} is called {re.sub(pattern, now, word)} now: give that instead")
-    if several := _SEVERAL_VALUES.match(_first_line(error)):
-        return ConfigError(
-            f"{several[1]} gives several values: if it is one, put it in quotes inside of the shell's, as in "
-            f"{_in_quotes(several[1])}, or add -m to run a sweep"
-        )
-    if unknown := _UNKNOWN.match(_first_line(error)):
-        meant = _similar_settings(name, unknown[1])
-        remedy = f"is {' or '.join(meant)} meant?" if meant else "--cfg job lists all"
-        return ConfigError(f"there is no setting {unknown[1]}: {remedy}")
-    if isinstance(error, MissingConfigException) and error.options:
-        return ConfigError(f"{_first_line(error)}: choose one of {', '.join(error.options)}")
-    return ConfigError(f"{_first_line(error)}: there is no such setting or choice (--help lists them)")
-
-
-def _similar_settings(name: str, typed: str) -> list[str]:
-    """Return the settings of a command that somebody may mean who types one that it does not have."""
-    try:
-        content: Any = OmegaConf.to_container(compose(name, []))
-    except ConfigError:
-        return []
-    known = list(_dotted(content))
-    last = typed.rpartition(".")[2]
-    same = [setting for setting in known if setting.rpartition(".")[2] == last]
-    return same if 0 < len(same) <= _MOST_SUGGESTIONS else get_close_matches(typed, known, n=1, cutoff=0.8)
-
-
-def _dotted(content: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    for key, value in content.items():
-        yield f"{prefix}{key}"
-        if isinstance(value, Mapping):
-            yield from _dotted(value, f"{prefix}{key}.")
-
-
-def _unreadable_setting(error: OverrideParseException) -> ConfigError:
-    """Return what to say of a word that is no setting in Hydra's grammar."""
-    key, is_setting, _ = str(error.override).partition("=")
-    if not is_setting:
-        return ConfigError(
-            f"{key} is no setting and no option: settings are written key=value (--help lists them)"
-        )
-    if _KEY.fullmatch(key) is None:
-        return ConfigError(
-            f"{key} in {error.override} is no name of a setting: settings are written key=value"
-        )
-    return ConfigError(
-        f"the value of {error.override} is not one that Hydra reads: put it in quotes inside of the shell's, "
-        f"as in {_in_quotes(str(error.override))}"
-    )
-
-
-def _in_quotes(setting: str) -> str:
-    """Return a setting as one types it for its value to be text, whatever characters it has."""
-    key, _, value = setting.partition("=")
-    return shlex.quote(f"{key}={quoted(value)}")
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0].rstrip(".")
 
 
 def _set_full_error(value: str | None) -> None:
@@ -292,9 +245,17 @@ def typed_config_dir(hydra_config: Any) -> list[str]:
     return ["--config-dir", *folders] if folders else []
 
 
-def run_or_exit(function: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
-    """Return ``function(cfg)``; a mistake of the user's becomes a sentence on stderr and exit code 1."""
+def run_or_exit(function: Callable[[DictConfig], Any], cfg: DictConfig, *, command: str = "") -> Any:
+    """Return ``function(cfg)``; a mistake of the user's becomes a sentence on stderr and exit code 1.
+
+    Args:
+        function: the command.
+        cfg: its settings.
+        command: name of its config, inside of Hydra; empty elsewhere, where nothing was typed.
+    """
     try:
+        if command:
+            _check_typed(command, cfg)
         if OmegaConf.is_config(cfg):
             check_settings(OmegaConf.to_container(cfg, resolve=False))  # type: ignore[arg-type]
         return function(cfg)
@@ -305,8 +266,11 @@ def run_or_exit(function: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
         if isinstance(error.__cause__, RaytranError):
             _exit_with(error.__cause__)
         raise
+    except MissingMandatoryValue as error:
+        _exit_with(missing_setting(error, command) if command else ConfigError(first_line(error)))
     except OmegaConfBaseException as error:
-        _exit_with(ConfigError(f"{str(error).splitlines()[0]} (see --cfg job for all settings)"))
+        where = f"{error.full_key}: " if error.full_key else ""
+        _exit_with(ConfigError(f"{where}{first_line(error)} (see --cfg job for all settings)"))
     except KeyboardInterrupt as stop:
         sys.stderr.write("raytran: interrupted\n")
         raise SystemExit(_INTERRUPTED) from stop
@@ -319,6 +283,18 @@ def run_or_exit(function: Callable[[DictConfig], Any], cfg: DictConfig) -> Any:
         _exit_with(
             DataError(f"cannot {place} ({full.strerror}): make room there, then give the command again")
         )
+
+
+def _check_typed(command: str, cfg: DictConfig) -> None:
+    """Raise ``ConfigError`` where what was typed for a setting is not of its kind."""
+    hydra_config = HydraConfig.get()
+    check_kinds(
+        command,
+        cfg,
+        typed_settings(hydra_config),
+        groups=set(hydra_config.runtime.choices),
+        default=lambda groups: compose(command, groups),
+    )
 
 
 def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
@@ -340,9 +316,9 @@ def compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
         try:
             return hydra.compose(config_name, overrides=literal_paths(config_name, overrides))
         except ConfigCompositionException as error:
-            raise _no_such_setting(config_name, error, overrides) from error
+            raise no_such_setting(error, overrides, known=lambda: compose(config_name, [])) from error
         except OverrideParseException as error:
-            raise _unreadable_setting(error) from error
+            raise unreadable_setting(error) from error
 
 
 def typed_settings(hydra_config: Any) -> list[str]:
@@ -364,18 +340,26 @@ def with_number_lists(words: Sequence[str]) -> list[str]:
     return [word if match is None else f"{match[1]}=[{match[2]}]" for word, match in typed]
 
 
-def name_positional(words: Sequence[str], key: str) -> list[str]:
-    """Return the words of a command line, with ``key=`` before one that is neither a setting nor an option.
+def with_keys(command: str, words: Sequence[str]) -> list[str]:
+    """Return the words of a command line, with a key before the path that was typed without one.
 
     Args:
+        command: name of its config.
         words: as typed.
-        key: setting that a word without a key means.
+
+    Raises:
+        ConfigError: there are two such paths, or the setting that one means is given as well.
     """
     named: list[str] = []
     before = ""
     for word in words:
         is_other = word.startswith("-") or before in _WITH_VALUE or _is_setting(word)
-        named.append(word if is_other else f"{key}={quoted(word)}")
+        key = None if is_other else key_of_path(command, word)
+        if key is not None and any(other.startswith(f"{key}=") for other in (*named, *words)):
+            raise ConfigError(
+                f"{word} is a path without a name, and {key}= is there already: name it, KEY={word}"
+            )
+        named.append(word if key is None else f"{key}={quoted(word)}")
         before = word
     return named
 
@@ -383,7 +367,7 @@ def name_positional(words: Sequence[str], key: str) -> list[str]:
 def _is_setting(word: str) -> bool:
     """Return whether a word is ``key=value``, and not the name of a folder that has an equals sign."""
     key, equals, _ = word.partition("=")
-    return bool(equals and _KEY.fullmatch(key)) and not os.path.exists(word)
+    return bool(equals and KEY.fullmatch(key)) and not os.path.exists(word)
 
 
 def _exit_if_refused(error: BaseException) -> None:

@@ -51,6 +51,19 @@ PATH_SETTINGS = {
 }
 """Command → those of its settings that are paths."""
 
+_TYPED_ALONE = {
+    "predict": "scene",
+    "view": "folder",
+    "plan": "scene",
+    "demo": "output",
+    "prepare": "check",
+    "export_model": "checkpoint",
+    "evaluate": "predictions",
+}
+"""Command → the setting that a path without a key means."""
+
+_WEIGHTS = (".ckpt", ".safetensors")
+
 _LISTS = ("draw_with",)
 """Those that take several, in brackets."""
 
@@ -79,6 +92,18 @@ def without_references(text: str) -> str:
     """Return a text that is ``text`` when OmegaConf has read it once, references and all."""
     # OmegaConf reads \${ as text, and two backslashes before it as one.
     return _REFERENCE.sub(lambda found: rf"{found[1] * 2}\${{", text)
+
+
+def key_of_path(command: str, path: str) -> str | None:
+    """Return the setting of a command that a path without a key means, None if it takes none.
+
+    Args:
+        command: name of its config.
+        path: as typed.
+    """
+    if command == "evaluate" and (path == "default" or path.endswith(_WEIGHTS)):
+        return "checkpoint"
+    return _TYPED_ALONE.get(command)
 
 
 def literal_paths(command: str, words: Sequence[str]) -> list[str]:

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import json
+import re
 from functools import cache
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -112,6 +114,35 @@ def config(folder, output, **changes) -> DictConfig:
     paths = {"checkpoint": "a.ckpt", "scene": str(folder), "output": str(output)}
     small = {"num_overlays": 2, "turntable": 2, "views_at_once": 4, "device": "cpu", "duplicate_iou": 0.5}
     return OmegaConf.merge(settings_of_the_command(), paths | small | changes)
+
+
+def test_the_log_names_weights_device_steps_and_seconds(scene, oracle, tmp_path, caplog):
+    caplog.set_level("INFO")
+    module.predict(config(scene, tmp_path / "out"))
+    threads = torch.get_num_threads()
+    on = f"the CPU ({threads} thread{'s' if threads > 1 else ''})"
+    assert caplog.messages[0] == f"a.ckpt (preset tiny, stage3) on {on}"
+    said = [message for message in caplog.messages if message.endswith(" …")]
+    assert said == [f"reading {scene} …", "predicting from 4 frames …", "writing meshes and pictures …"]
+    (found,) = [message for message in caplog.messages if message.startswith("living_room: 1 objects")]
+    assert re.search(rf"1 of them with a mesh, in \d+ s on {re.escape(on)}$", found)
+    assert "generated rooms" not in caplog.text
+
+
+def test_the_shipped_weights_say_what_they_do_not_know(scene, oracle, tmp_path, caplog):
+    caplog.set_level("INFO")
+    module.predict(config(scene, tmp_path / "out", checkpoint="default"))
+    assert caplog.messages[0].startswith("raytran's own weights, rooms-v1-laptop.safetensors (preset tiny")
+    assert [record.message for record in caplog.records if record.levelname == "WARNING"].count(
+        module.ONLY_ROOMS
+    ) == 1
+
+
+def test_results_have_a_place_of_their_own(scene, oracle, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    written = module.predict(OmegaConf.merge(config(scene, "x"), {"output": None}))
+    assert written == Path("outputs/predictions/living_room")
+    assert (tmp_path / written / "scene.json").is_file()
 
 
 def test_all_files_are_written(scene, oracle, tmp_path):

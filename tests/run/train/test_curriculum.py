@@ -64,7 +64,7 @@ def test_a_damaged_record_is_one_sentence(tmp_path, text):
 @pytest.mark.parametrize(
     ("stages", "message"),
     [
-        (("stage1", "stage9"), "experiment/stage9"),
+        (("stage1", "stage9"), "there is no experiment=stage9"),
         (("gt_masks_stage1",), "is called variant=gt_masks experiment=stage1 now"),
     ],
 )

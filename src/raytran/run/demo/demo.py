@@ -106,7 +106,8 @@ def demo(cfg: DictConfig) -> DemoResult:
 
 def _demo(cfg: DictConfig, output: Path) -> DemoResult:
     """Make the demo in a folder that nobody else writes."""
-    overrides = [f"preset={cfg.preset}", f"data.root={quoted(output / 'rooms')}", *plain(cfg.overrides)]
+    rooms = [f"data.root={quoted(output / 'rooms')}", "rooms.make=true"]
+    overrides = [f"preset={cfg.preset}", *rooms, *plain(cfg.overrides)]
     data = _data(cfg, overrides, output)
     times = StepTimes(output / "times.json")
     with times.measure("rooms", continues=True):
@@ -132,7 +133,9 @@ def _data(demo_cfg: DictConfig, overrides: Sequence[str], output: Path) -> Scene
     cfg = compose("train", [*overrides, *_SETTINGS, f"output_dir={quoted(output)}"])
     wanted = {
         name: value if isinstance(value := cfg[name], str | int) else plain(value) for name in _RECORDED
-    } | {name: plain(demo_cfg)[name] for name in ("validate_every", "learned")}
+    }
+    wanted["rooms"] = {name: value for name, value in plain(cfg.rooms).items() if name != "make"}
+    wanted |= {name: plain(demo_cfg)[name] for name in ("validate_every", "learned")}
     if SettingsRecord(output / _RECORD).begin(wanted):
         raise ConfigError(
             f"{output} holds a demo with other settings: delete it or give output=ANOTHER_FOLDER"

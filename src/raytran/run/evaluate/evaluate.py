@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import logging
+import shlex
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -27,7 +28,7 @@ from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
 from raytran.model import RayTran
 from raytran.postprocess import DUPLICATE_IOU, SCORE_THRESHOLD
-from raytran.run.device import choose_device, set_matmul_precision
+from raytran.run.device import choose_device, device_name, set_matmul_precision
 from raytran.run.entry import compose, typed_settings
 from raytran.run.evaluate.results import MAP, MARKER, Evaluation, read_curves, result_tables, write_evaluation
 from raytran.run.evaluate.score import ProtocolScores, confidence, evaluate_predictions
@@ -73,6 +74,8 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
     for table in result_tables(evaluation, title=title):
         console.print(table)
     _log.info("wrote %s: %s", output.resolve(), ", ".join(files))
+    if cfg.checkpoint is not None:
+        _log.info("next: python -m raytran.predict SCENE %s", shlex.quote(f"checkpoint={cfg.checkpoint}"))
     return evaluation.metrics
 
 
@@ -117,9 +120,16 @@ def _of_checkpoint(cfg: DictConfig) -> tuple[Evaluation, str]:
     split = cfg.split or "val"
     data = build_data(cfg)
     data.prepare_data()
+    scenes = first_of(cfg.max_scenes, with_at_most(cfg.max_objects, data.split(split)))
+    _log.info(
+        "%s (preset %s, %s) on %s: %d %s scenes of %s",
+        checkpoint_path(cfg.checkpoint),
+        *(settings.preset, settings.stage, device_name(device)),
+        *(len(scenes), split, data.root),  # type: ignore[arg-type]
+    )
     evaluation = evaluate_model(
         model,
-        first_of(cfg.max_scenes, with_at_most(cfg.max_objects, data.split(split))),
+        scenes,
         tasks=tasks,
         score_threshold=cfg.score_threshold,
         duplicate_iou=cfg.duplicate_iou,

@@ -5,22 +5,25 @@ from __future__ import annotations
 
 import logging
 import shlex
+import time
 from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
+import torch
 from omegaconf import DictConfig
 
 from raytran.capture.open import open_scene, parse_intrinsics
 from raytran.capture.orientation import WorldSettings
 from raytran.capture.recording import Intrinsics
+from raytran.checkpoints.file import checkpoint_path, shipped_weights
 from raytran.checkpoints.load import PredictionSettings, load_model, prediction_settings
 from raytran.checkpoints.network import trusted_packages
 from raytran.data.shapenet.models import shapenet_version
 from raytran.errors import ConfigError
 from raytran.model import RayTran
 from raytran.postprocess import count_object_views, merge_volumes, object_meshes, select_objects
-from raytran.run.device import choose_device, set_matmul_precision
+from raytran.run.device import choose_device, device_name, set_matmul_precision
 from raytran.run.output import one_writer
 from raytran.run.predict.new_views import cameras_to_render, render_views
 from raytran.run.predict.room import RoomViews, check_choice, read_room
@@ -32,6 +35,14 @@ from raytran.viewer.data import predicted_volumes
 from raytran.viewer.truth import read_truth
 
 _LOG = logging.getLogger(__name__)
+
+PREDICTIONS = Path("outputs") / "predictions"
+"""Where results go if nothing else is said, each by the name of its scene."""
+
+ONLY_ROOMS = (
+    "these weights have seen generated rooms alone: in a real room expect some chairs and tables about where "
+    "they are, and furniture that is not there, at high scores too"
+)
 
 _UNTRAINED = {
     "stage1": "its objects mean nothing yet; predict with a checkpoint of stage3",
@@ -62,18 +73,22 @@ def predict(cfg: DictConfig) -> Path:
         CheckpointError: the checkpoint is missing or damaged.
         DataError: the scene's folder is missing or damaged.
     """
-    recording, output = Path(cfg.scene).resolve(), Path(cfg.output)
+    began = time.monotonic()
+    recording = Path(cfg.scene).resolve()
+    output = Path(cfg.output) if cfg.output else PREDICTIONS / _scene_id(recording)
     world = WorldSettings(up=cfg.up, scale=cfg.scale, convention=cfg.convention, check=cfg.check)
     intrinsics = parse_intrinsics(cfg.intrinsics)
     check_choice(cfg.frames, cfg.num_views)
     check_pictures(num_overlays=cfg.num_overlays, turntable=cfg.turntable)
     with one_writer(output, marker=MARKER):
-        return _predict(cfg, recording, output, world, intrinsics)
+        device, scene = _predict(cfg, recording, output, world, intrinsics)
+    _report(output, scene, f"in {time.monotonic() - began:.0f} s on {device_name(device)}")
+    return output
 
 
 def _predict(
     cfg: DictConfig, recording: Path, output: Path, world: WorldSettings, intrinsics: Intrinsics | None
-) -> Path:
+) -> tuple[torch.device, PredictedScene]:
     """Predict with settings that were checked, into a folder that nobody else writes."""
     if cfg.cads:
         shapenet_version(Path(cfg.cads))  # It raises where there are none, before the network runs.
@@ -84,11 +99,14 @@ def _predict(
     set_matmul_precision(cfg.matmul_precision, device)
     model = load_model(cfg.checkpoint, attention=cfg.attention, trust=trusted_packages(cfg.trust))
     model = model.to(device)
+    _introduce(cfg.checkpoint, settings, device)
     _check_channels(model, cfg.checkpoint)
     new_cameras = cameras_to_render(cfg.views, model, cfg.checkpoint)
-    scene_id = recording.stem if recording.is_file() else recording.name
+    scene_id = _scene_id(recording)
     truth = read_truth(Path(cfg.truth), scene_id, model.classes) if cfg.truth else None
+    _LOG.info("reading %s …", recording)
     room = _read_room(cfg, world, intrinsics, settings, model)
+    _LOG.info("predicting from %d frames …", len(room.frame_ids))
     scene = predict_scene(
         model,
         room,
@@ -101,6 +119,7 @@ def _predict(
     )
     if cfg.cads:
         scene = scene.with_cads(Path(cfg.cads))
+    _LOG.info("writing meshes and pictures …")
     write_scene(
         output,
         scene,
@@ -113,8 +132,21 @@ def _predict(
     )
     if new_cameras is not None:
         render_views(model, room, new_cameras, output, views_at_once=cfg.views_at_once)
-    _report(output, scene)
-    return output
+    return device, scene
+
+
+def _scene_id(recording: Path) -> str:
+    return recording.stem if recording.is_file() else recording.name
+
+
+def _introduce(checkpoint: str, settings: PredictionSettings, device: torch.device) -> None:
+    """Say which weights predict, and where; of those that raytran carries, what they do not know."""
+    path = checkpoint_path(checkpoint)
+    is_shipped = path == shipped_weights()
+    name = f"raytran's own weights, {path.name}" if is_shipped else str(path)
+    _LOG.info("%s (preset %s, %s) on %s", name, settings.preset, settings.stage, device_name(device))
+    if is_shipped:
+        _LOG.warning("%s", ONLY_ROOMS)
 
 
 def predict_scene(
@@ -229,14 +261,18 @@ def _check_channels(model: RayTran, checkpoint: str) -> None:
         )
 
 
-def _report(output: Path, scene: PredictedScene) -> None:
+def _report(output: Path, scene: PredictedScene, how_long: str) -> None:
+    """Say what was found, where it is, and how to look at it."""
     count, meshes = len(scene.prediction.objects), sum(mesh is not None for mesh in scene.meshes)
     if count:
-        _LOG.info("%s: %d objects, %d of them with a mesh", scene.prediction.scene_id, count, meshes)
+        _LOG.info(
+            "%s: %d objects, %d of them with a mesh, %s", scene.prediction.scene_id, count, meshes, how_long
+        )
     else:
         _LOG.info(
-            "%s: no object has a score above the threshold; lower score_threshold to see weaker ones",
+            "%s: no object has a score above the threshold, %s; lower score_threshold to see weaker ones",
             scene.prediction.scene_id,
+            how_long,
         )
     _LOG.info("wrote %s: %s", output.resolve(), ", ".join(sorted(path.name for path in output.iterdir())))
     if scene.volumes is not None and has_viser():

@@ -4,13 +4,16 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import lightning.pytorch as pl
 import torch
+from hydra.errors import InstantiationException
 from hydra.utils import instantiate
 from lightning.pytorch.callbacks import EarlyStopping, LearningRateMonitor, ModelCheckpoint
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from omegaconf import DictConfig, OmegaConf
 
 from raytran.checkpoints.file import BEST_NAME
@@ -145,15 +148,34 @@ def build_trainer(
     elif run.progress_bar == "tqdm":
         callbacks.append(LossBar())
     loggers = [instantiate(logger, _convert_="all") for logger in plain(cfg.logger).values()]
-    return instantiate(
-        settings,
-        default_root_dir=str(folder),
-        logger=[MetricsTable(folder / METRICS), *loggers],
-        callbacks=callbacks,
-        plugins=[AtomicCheckpointIO(), *([SyncedBatchNorm(on_cpu=on_cpu)] if cfg.sync_norms else [])],
-        enable_progress_bar=run.progress_bar == "tqdm",
-        _convert_="all",
-    )
+    try:
+        return instantiate(
+            settings,
+            default_root_dir=str(folder),
+            logger=[MetricsTable(folder / METRICS), *loggers],
+            callbacks=callbacks,
+            plugins=[AtomicCheckpointIO(), *([SyncedBatchNorm(on_cpu=on_cpu)] if cfg.sync_norms else [])],
+            enable_progress_bar=run.progress_bar == "tqdm",
+            _convert_="all",
+        )
+    except InstantiationException as error:
+        if isinstance(error.__cause__, MisconfigurationException):
+            raise ConfigError(_no_trainer(settings, error.__cause__)) from error
+        raise
+
+
+def _no_trainer(settings: Mapping[str, Any], error: Exception) -> str:
+    """Return what to say of a Trainer that Lightning refuses to build."""
+    asked = f"trainer.accelerator={settings['accelerator']} trainer.devices={settings['devices']}"
+    if settings["accelerator"] not in ("gpu", "cuda"):
+        return f"{asked} will not do: {' '.join(str(error).split())}"
+    count = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if count == 0:
+        return (
+            f"{asked} asks for a GPU, and torch {torch.__version__} finds none here: give trainer=cpu, or "
+            "trainer=ddp_cpu for two processes"
+        )
+    return f"{asked} asks for more than is here, {count} GPUs: give trainer.devices={count} or fewer"
 
 
 def _averaged_weights(cfg: DictConfig) -> list[pl.Callback]:

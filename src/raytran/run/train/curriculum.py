@@ -21,6 +21,7 @@ from raytran.errors import ConfigError, RaytranError
 from raytran.run.entry import compose, typed_config_dir, typed_settings, user_environment
 from raytran.run.path_settings import quoted
 from raytran.run.train.fit import FitResult, train
+from raytran.run.train.next_command import tell_use
 from raytran.training.callbacks.stop_signals import forward_signals
 
 _log = logging.getLogger(__name__)
@@ -35,7 +36,9 @@ def curriculum(cfg: DictConfig) -> list[FitResult]:
     overrides = [
         item for item in typed_settings(HydraConfig.get()) if item.split("=")[0].lstrip("+~") not in _OWN
     ]
-    return run_curriculum(overrides, output_dir=Path(cfg.output_dir), stages=tuple(cfg.stages))
+    results = run_curriculum(overrides, output_dir=Path(cfg.output_dir), stages=tuple(cfg.stages))
+    tell_use(results[-1].checkpoint)
+    return results
 
 
 def run_curriculum(

@@ -23,7 +23,7 @@ from raytran.checkpoints.runs import FINISHED, LAST, one_at_a_time, read_finishe
 from raytran.classes import Classes
 from raytran.data.files import write_json, write_text
 from raytran.errors import CheckpointError, ConfigError
-from raytran.run.device import cudnn_warning, set_matmul_precision
+from raytran.run.device import cudnn_warning, device_name, set_matmul_precision
 from raytran.run.train.build import build_data, build_model, build_module, build_trainer, plain
 from raytran.run.train.learning_rate import find_learning_rate
 from raytran.run.train.memory import explained_out_of_memory
@@ -107,7 +107,10 @@ def _train(cfg: DictConfig, run: RunConfig, folder: Path) -> FitResult:
     data = build_data(cfg)
     if trainer.is_global_zero:
         _describe_run(cfg, folder)
-    _log.info("%s, %d steps, in %s", module.stage.name, trainer.max_steps, folder)
+    devices = (
+        device_name(device) if trainer.world_size == 1 else f"{trainer.world_size} x {device_name(device)}"
+    )
+    _log.info("%s, %d steps on %s, in %s", module.stage.name, trainer.max_steps, devices, folder)
     for line in start_report(module.stage, module.model, metadata, trust=run.trust):
         _log.info("%s", line)
     warning = cudnn_warning(device, str(trainer.precision))
@@ -264,7 +267,12 @@ def _to_continue(run: RunConfig) -> tuple[Path, dict[str, Any]] | None:
         return Path(run.resume), read_checkpoint(Path(run.resume))
     found = read_newest((Path(run.output_dir) / LAST).parent)
     if found is None:
-        _log.info("nothing to continue: this is a new run")
+        runs = Path(run.outputs) / run.preset / run.experiment
+        # Where a folder was named, a curriculum's for one, there need not be anything yet.
+        was_searched = Path(run.output_dir).resolve().parent == runs.resolve()
+        level = logging.WARNING if was_searched else logging.INFO
+        where = f"no unfinished run in {runs} has a checkpoint" if was_searched else "nothing to continue"
+        _log.log(level, "%s: this is a new run, from the first step", where)
     return found
 
 

@@ -81,7 +81,7 @@ class RunConfig:
         try:
             typed = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(RunConfig), values))
         except OmegaConfBaseException as error:
-            raise ConfigError(str(error).splitlines()[0]) from error
+            raise ConfigError(f"{error.full_key}: {str(error).splitlines()[0]}") from error
         if not isinstance(typed, RunConfig):
             raise ConfigError(f"expected the settings of a run, got {type(typed).__name__}")
         if typed.progress_bar not in PROGRESS_BARS:

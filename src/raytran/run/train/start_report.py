@@ -18,6 +18,8 @@ _NOT_COMPUTED = {
 }
 """Top-level settings that say where and how a run goes on, not what it computes."""
 
+_WHETHER_MADE = ("rooms.make", "data.make.allowed", "data.make.usual")
+"""Settings that say whether rooms may be made, not which."""
 
 _BEFORE_THEY_WERE_KEYS = {
     "loss.shape_layers": "last",
@@ -102,6 +104,10 @@ def changed_settings(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[
             old[setting] = renamed[bool(old[setting])]
     if "data.name" not in old:
         new.pop("data.name", None)
+    old, new = (
+        {name: value for name, value in settings.items() if name not in _WHETHER_MADE}
+        for settings in (old, new)
+    )
     names = [name for name in {**old, **new} if old.get(name) != new.get(name)]
     return [f"{name}: {old.get(name, 'unset')} → {new.get(name, 'unset')}" for name in names]
 
