@@ -26,6 +26,7 @@ PRESETS = ("raytran", "small", "laptop", "tiny")
 TRAINERS = ("auto", "cpu", "gpu", "ddp", "ddp_cpu")
 # Given by the code that instantiates the node, not by the config.
 GIVEN_BY_CODE = {
+    "raytran.model.RayTran": {"score_scaling"},  # found after training, by export_model calibration=
     "raytran.extensions.proposal_queries.ProposalQueries": {"channels", "num_queries"},
     "raytran.extensions.windowed_attention.WindowedAttention": {"channels", "num_heads"},
     "raytran.extensions.unet3d.VoxelEncoderDecoder": {"channels"},

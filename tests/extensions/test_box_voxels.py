@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the shape head reads in a predicted box."""
 
 from __future__ import annotations

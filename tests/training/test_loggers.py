@@ -271,8 +271,6 @@ def test_runs_of_a_sweep_or_a_curriculum_are_a_group(tmp_path):
 
 def test_wandb_is_told_tags_and_no_setting_that_it_has_given_up(tmp_path):
     tags = ["tiny", "stage1", None, "tiny"]
-    logger = wandb_logger(
-        project="p", name="n", save_dir=str(tmp_path), tags=["tiny", "stage1", None, "tiny"]
-    )
+    logger = wandb_logger(project="p", name="n", save_dir=str(tmp_path), tags=tags)
     assert logger._wandb_init["tags"] == ["tiny", "stage1"]
     assert "anonymous" not in logger._wandb_init

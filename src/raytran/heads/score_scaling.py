@@ -46,7 +46,7 @@ class ScoreScaling:
             )
         except (DataError, KeyError, TypeError) as error:
             raise ConfigError(
-                f"score_scaling={settings} is no pair of a scale and an offset ({error})"
+                f"the scaling of scores is no pair of a scale and an offset, but {settings} ({error})"
             ) from error
 
     def __call__(self, score: Tensor) -> Tensor:
