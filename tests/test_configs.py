@@ -86,7 +86,8 @@ def arguments(path):
         parameters |= {name: value for name, value in passed_on.items() if name not in FIXED_BY_LAYOUT}
         del parameters["options"]
     if path == "raytran.rooms.ensure.ensure_rooms":
-        parameters = dict(inspect.signature(generate_rooms).parameters)
+        del parameters["settings"]
+        parameters |= inspect.signature(generate_rooms).parameters
     return parameters
 
 
@@ -96,6 +97,7 @@ def arguments(path):
     [
         ("data=rooms",),
         ("data=rooms-v1",),
+        ("data=rooms-v2",),
         ("data=scan2cad", "data.root=somewhere"),
         ("model/backbone=unprojection",),
     ],

@@ -46,5 +46,5 @@ def test_other_classes_are_not_right_and_no_bin_is_refused():
     metric.update([objects([4], [[0, 0, 0]])], [objects([3], [[0, 0, 0]])], ["a"])
     result = metric.compute()
     assert (result["expected_error"], result["scaling"]) == (1.0, None)
-    with pytest.raises(ConfigError, match="num_bins=0 is too few"):
+    with pytest.raises(ConfigError, match="0 bins of scores are too few"):
         ScoreCalibration(num_bins=0)

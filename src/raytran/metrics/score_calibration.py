@@ -50,7 +50,7 @@ class ScoreCalibration(ObjectMetric):
     def __init__(self, *, iou_threshold: float = 0.25, num_bins: int = NUM_BINS, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         if num_bins < 1:
-            raise ConfigError(f"num_bins={num_bins} is too few, give at least 1")
+            raise ConfigError(f"{num_bins} bins of scores are too few: give at least 1")
         self.iou_threshold, self.num_bins = iou_threshold, num_bins
 
     def judge(self, predictions: ObjectSet, targets: ObjectSet) -> tuple[Tensor, Tensor]:
