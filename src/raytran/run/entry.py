@@ -35,6 +35,7 @@ from raytran.errors import ConfigError, DataError, RaytranError, page
 from raytran.run.closed_pipe import survive_closed_pipe
 from raytran.run.config_dir import config_dir
 from raytran.run.help_page import help_page
+from raytran.run.lazy_help import let_help_be_lazy
 from raytran.run.path_settings import check_run_folder, key_of_path, literal_paths, quoted
 from raytran.run.refused_run import remove_refused_run
 from raytran.run.setting_mistakes import (
@@ -89,6 +90,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
     """
     register_resolvers()
     register_sweep_resolver()
+    let_help_be_lazy()
     _let_threads_sleep()
 
     def decorate(function: Callable[[DictConfig], Any]) -> Callable[[], Any]:
