@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Makes a site of the pages, which are written to be read in a clone: a hook of MkDocs, see ``mkdocs.yml``.
 
-In a clone pages link to each other by relative paths, also to what lies outside of ``docs/``: conventions, notebooks,
-sources. Here these become pages too (a source file the page of its module), and links lead to them; links to files
-that no page is made of become plain names.
+In a clone pages link to each other by relative paths, also to what lies outside of ``docs/``: conventions,
+notebooks, sources. Here these become pages too (a source file the page of its module), and links lead to them;
+links to files that no page is made of become plain names.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ PACKAGE = "src/raytran"
 OUTSIDE = {
     "README.md": "index.md",
     "docs/README.md": "pages.md",
-    "CONVENTIONS.md": "CONVENTIONS.md",
+    "CONVENTIONS.md": "axes-and-units.md",
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
     "CODE_OF_CONDUCT.md": "code-of-conduct.md",
@@ -161,9 +161,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         if source.endswith(".ipynb"):
             content = _notebook(ROOT / source, page, files, config)
         else:
-            content = (
-                _api(source) if source.endswith(".py") else (ROOT / source).read_text(encoding="utf-8")
-            )
+            content = _api(source) if source.endswith(".py") else (ROOT / source).read_text(encoding="utf-8")
         files.append(File.generated(config, page, content=content))
     return files
 
