@@ -4,7 +4,7 @@ VENV   ?= .venv
 BIN    := $(VENV)/bin
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test test-fast test-nightly fuzz lint format docs notebooks resolve clean
+.PHONY: help install demo test test-fast test-nightly fuzz lint format docs notebooks resolve lock clean
 
 help:  ## Show this list
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1|\2/' | column -t -s '|'
@@ -53,6 +53,9 @@ notebooks: install  ## Execute the notebooks and keep what they print and draw
 
 resolve: build/uv/bin/uv  ## Check that PyPI alone has versions for every way to install, Python and torch (downloads no package)
 	PATH="build/uv/bin:$$PATH" requirements/resolve.sh
+
+lock: build/uv/bin/uv  ## Write uv.lock: the versions of requirements/ci.txt, and of all extras, with hashes
+	PATH="build/uv/bin:$$PATH" requirements/lock.sh
 
 build/uv/bin/uv:
 	$(PYTHON) -m venv build/uv

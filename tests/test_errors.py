@@ -9,7 +9,7 @@ import re
 
 import pytest
 
-from raytran.errors import LONGEST, CheckpointError, DataError, RaytranError, ShapeError, one_line
+from raytran.errors import LONGEST, CheckpointError, DataError, RaytranError, ShapeError, one_line, page
 from raytran.run.entry import _exit_with
 
 LONGEST_LITERAL = 200
@@ -91,3 +91,30 @@ def test_messages_leave_room_for_the_values_in_them(project_root):
         length = sum(map(len, parts))
         assert length <= LONGEST_LITERAL, f"{where}: {length} characters beside its values, shorten it"
         assert not re.search(r"\n|\.\s+[A-Z][a-z]", "{}".join(parts)), f"{where}: more than one sentence"
+
+
+def test_a_page_lies_in_the_package_or_in_the_clone(tmp_path, project_root):
+    assert page("own-data.md") == str(project_root / "docs" / "own-data.md")
+    package = tmp_path / "site" / "packages" / "raytran"
+    assert page("own-data.md", package) == "docs/own-data.md"
+    (package / "docs").mkdir(parents=True)
+    (package / "docs" / "own-data.md").touch()
+    assert page("own-data.md", package) == str(package / "docs" / "own-data.md")
+    assert page(".", package) == str(package / "docs")
+
+
+def test_pages_that_messages_name_are_there(project_root):
+    """Without a clone ``docs/x.md`` is no path: messages say where the page lies, by ``page``."""
+    named = 0
+    for path in sorted((project_root / "src" / "raytran").rglob("*.py")):
+        tree = ast.parse(path.read_text())
+        documented = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "page":
+                named += 1
+                assert (project_root / "docs" / node.args[0].value).exists(), f"{path}:{node.lineno}"
+            is_text = isinstance(node, ast.Constant) and isinstance(node.value, str)
+            if is_text and id(node) not in documented:
+                bare = re.search(r"(?<![/.])\bdocs/[\w/-]+\.md", node.value)
+                assert bare is None, f"{path}:{node.lineno}: name it by raytran.errors.page"
+    assert named > 3

@@ -19,13 +19,14 @@ def load(checkpoint: str | Path = "default", *, trust: Iterable[str] = ()) -> Ra
 
     Args:
         checkpoint: a ``.ckpt`` file that training wrote, a ``.safetensors`` file that was exported from one,
-            or ``default`` for the weights that the package carries (``raytran/weights/README.md``).
+            ``default`` for the weights that the package carries (``raytran/weights/README.md``), or
+            ``hf:owner/name[/FILE.safetensors][@revision]`` for weights on the Hugging Face hub.
         trust: top-level packages of your own whose networks the file may name, e.g. ``("mylab",)``: they are
             imported and run. A file can never add to them.
 
     Raises:
         CheckpointError: the file is missing or damaged, or names a class of a package that is not trusted, or
-            the package was built without weights.
+            the package was built without weights, or the hub cannot be reached.
         ConfigError: ``trust`` is no list of packages.
     """
     # Imported here so that ``import raytran`` stays light.

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -17,6 +18,22 @@ _KEPT_OF_WORDS = (40, 20)
 """Characters that the longest words keep: so many first, so many if that does not do."""
 
 _FROM_A_WORKER = re.compile(r"Caught \w+ in DataLoader worker process \d+\.\n")
+
+
+_PACKAGE = Path(__file__).resolve().parent
+
+
+def page(name: str, package: Path = _PACKAGE) -> str:
+    """Return where a page lies, so that a message can name it: in the installed package, or in the clone.
+
+    Args:
+        name: of a page below ``docs/``, e.g. ``own-data.md``; ``.`` is the folder itself.
+        package: the folder of the package ``raytran``.
+    """
+    for folder in (package / "docs", package.parents[1] / "docs"):
+        if (folder / name).exists():
+            return str(folder / name)
+    return f"docs/{name}"
 
 
 class RaytranError(Exception):

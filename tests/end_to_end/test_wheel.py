@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -82,8 +83,28 @@ def test_all_that_is_no_python_is_inside(site: Path, project_root: Path) -> None
 
     def files(package: Path) -> set[Path]:
         found = {path.relative_to(package) for path in package.rglob("*.*") if path.is_file()}
-        return {path for path in found if path.suffix not in (".py", ".pyc") and path.parts[0] != "conf"}
+        own = {path for path in found if path.parts[0] not in ("conf", "docs", "CONVENTIONS.md")}
+        return {path for path in own if path.suffix not in (".py", ".pyc")}
 
     assert files(site / "raytran") == files(project_root / "src" / "raytran")
     assert any(path.suffix == ".safetensors" for path in files(site / "raytran"))
     assert any(path.suffix == ".j2" for path in files(site / "raytran"))
+    assert (site / "raytran" / "py.typed").is_file()
+
+
+def test_the_pages_that_messages_name_are_inside(site: Path, project_root: Path, tmp_path: Path) -> None:
+    pages = {path.relative_to(project_root) for path in (project_root / "docs").rglob("*.md")}
+    assert pages == {path.relative_to(site / "raytran") for path in (site / "raytran" / "docs").rglob("*.md")}
+    assert (site / "raytran" / "CONVENTIONS.md").is_file()
+    assert not list((site / "raytran" / "docs").rglob("*.py"))
+    shown = run(site, tmp_path, "-m", "raytran.predict", "--help")
+    assert f"docs/… below lie in {site / 'raytran' / 'docs'}\n" in shown.stdout
+
+
+def test_the_page_of_an_index_links_to_nothing_that_is_not_there(site: Path) -> None:
+    (metadata,) = site.glob("raytran-*.dist-info/METADATA")
+    text = metadata.read_text(encoding="utf-8")
+    links = re.findall(r"\]\(([^)]+)\)", text)
+    assert links
+    assert all(link.startswith("https://") for link in links), links
+    assert "![" not in text

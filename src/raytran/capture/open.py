@@ -24,7 +24,7 @@ from raytran.data.images import IMAGE_ENDINGS
 from raytran.data.scan import OpenScan
 from raytran.data.scannet.layout import Listing, recognise
 from raytran.data.scannet.scan import open_scan
-from raytran.errors import ConfigError, DataError
+from raytran.errors import ConfigError, DataError, page
 from raytran.limits import FOCAL_LENGTH, PIXEL, as_number, shown
 
 _log = logging.getLogger(__name__)
@@ -214,7 +214,7 @@ def _unknown(path: Path) -> DataError:
     if find_images(path):
         return DataError(
             f"{path} has images without poses: let COLMAP or a phone's ARKit find them, or write "
-            "trajectory.txt and intrinsics.txt beside them (docs/own-data.md)"
+            f"trajectory.txt and intrinsics.txt beside them ({page('own-data.md')})"
         )
     return DataError(f"{path} holds {listing.summary(most=2)}, and no scene: read are {_READ}")
 

@@ -20,7 +20,7 @@ from raytran.capture.orientation import OPENGL
 from raytran.capture.recording import numbers
 from raytran.data.scannet.text import are_rigid
 from raytran.data.text import read_json_object
-from raytran.errors import DataError
+from raytran.errors import DataError, page
 from raytran.geometry.camera import Cameras
 from raytran.limits import MATRIX_ENTRY
 
@@ -67,7 +67,9 @@ def read_render_cameras(path: Path) -> RenderCameras:
     path = Path(path)
     content = read_json_object(path)
     if "views" not in content and "frames" not in content:
-        raise DataError(f"{path} has neither views nor frames: write cameras as docs/novel-view.md shows")
+        raise DataError(
+            f"{path} has neither views nor frames: write cameras as {page('novel-view.md')} shows"
+        )
     key = "views" if "views" in content else "frames"
     listed = content[key]
     if not isinstance(listed, list) or not listed or not all(isinstance(entry, dict) for entry in listed):

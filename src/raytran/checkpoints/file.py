@@ -27,6 +27,7 @@ from torch import Tensor
 
 import raytran
 from raytran.checkpoints.earlier import upgraded
+from raytran.checkpoints.hub import file_of_hub, is_on_hub
 from raytran.checkpoints.network import without_sources
 from raytran.data.files import UNFINISHED, whole_file
 from raytran.data.text import parse_json
@@ -386,11 +387,14 @@ _KEPT = (
 
 
 def checkpoint_path(checkpoint: str | Path) -> Path:
-    """Return the file that a checkpoint's name stands for.
+    """Return the file that a checkpoint's name stands for: a path, ``default``, or ``hf:owner/name``.
 
     Raises:
-        CheckpointError: it is ``default``, and the package was built without weights.
+        CheckpointError: it is ``default``, and the package was built without weights; or it is of the hub and
+            cannot be had, see ``file_of_hub``.
     """
+    if is_on_hub(str(checkpoint)):
+        return file_of_hub(str(checkpoint))
     if str(checkpoint) != DEFAULT:
         return Path(checkpoint)
     found = _files()

@@ -29,7 +29,8 @@ def load_model(
     """Return the model of a checkpoint, in evaluation mode, on the CPU.
 
     Args:
-        checkpoint: path of the file, or ``default`` for the weights that the package carries.
+        checkpoint: path of the file, ``default`` for the weights that the package carries, or
+            ``hf:owner/name`` for weights on the hub.
         attention: as in ``RayTran``; what the network was trained with does not matter.
         trust: packages of your own whose classes the file may name, see ``trusted_packages``.
 
@@ -67,7 +68,7 @@ def prediction_settings(checkpoint: str | Path) -> PredictionSettings:
     """Read how a checkpoint is to be used.
 
     Args:
-        checkpoint: path of the file, or ``default`` for the weights that the package carries.
+        checkpoint: as in ``load_model``.
 
     Raises:
         CheckpointError: the file is missing or damaged.

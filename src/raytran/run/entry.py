@@ -31,10 +31,11 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from raytran.checkpoints.runs import first_ranks, run_folder
 from raytran.data.files import disk_full
 from raytran.data.workers import ENDS_WITH, end_with_parent
-from raytran.errors import ConfigError, DataError, RaytranError
+from raytran.errors import ConfigError, DataError, RaytranError, page
 from raytran.run.closed_pipe import survive_closed_pipe
 from raytran.run.config_dir import config_dir
 from raytran.run.help_page import help_page
+from raytran.run.lazy_help import let_help_be_lazy
 from raytran.run.path_settings import check_run_folder, key_of_path, literal_paths, quoted
 from raytran.run.refused_run import remove_refused_run
 from raytran.run.setting_mistakes import (
@@ -89,6 +90,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
     """
     register_resolvers()
     register_sweep_resolver()
+    let_help_be_lazy()
     _let_threads_sleep()
 
     def decorate(function: Callable[[DictConfig], Any]) -> Callable[[], Any]:
@@ -395,9 +397,13 @@ def _exit_with(error: RaytranError) -> None:
 
 
 def register_resolvers() -> None:
-    """Make ``${run_folder:…}`` known to the configs; evaluated once per command, by the first rank."""
+    """Make the resolvers of the configs known.
+
+    ``${run_folder:…}`` is evaluated once per command, by the first rank; ``${pages:}`` is where ``docs/`` is.
+    """
 
     def resolve(*arguments: str) -> str:
         return first_ranks(f"the folder of {' '.join(arguments)}", lambda: run_folder(*arguments))
 
     OmegaConf.register_new_resolver("run_folder", resolve, use_cache=True, replace=True)
+    OmegaConf.register_new_resolver("pages", lambda: page("."), replace=True)

@@ -260,3 +260,17 @@ def test_what_evaluate_wrote_of_the_shipped_weights_leaves_nothing_to_scale_ther
     assert before["every_score"]["n_right"] > 0
     assert before["every_score"]["scaling"] != pytest.approx({"scale": 1.0, "offset": 0.0}, abs=0.1)
     assert after["every_score"]["scaling"] == pytest.approx({"scale": 1.0, "offset": 0.0}, abs=0.02)
+
+
+def test_a_card_says_what_the_weights_are_and_how_to_load_them(trained, tmp_path):
+    path = exported(trained, tmp_path, "card=true")
+    text = (path.parent / "README.md").read_text()
+    assert text.startswith("---\nlibrary_name: raytran\n")
+    assert 'raytran.load("hf:OWNER/NAME/rooms.safetensors")' in text
+    assert "| stage | stage3 |" in text
+    assert "| val/objects/f1_0.25 | 0.5 |" in text
+    assert "/home/me" not in text
+    (path.parent / "README.md").write_text("mine")
+    with pytest.raises(ConfigError, match="card=true would replace"):
+        exported(trained, tmp_path, "card=true")
+    assert (path.parent / "README.md").read_text() == "mine"

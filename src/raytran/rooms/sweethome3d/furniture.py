@@ -19,7 +19,7 @@ import numpy as np
 
 from raytran.data.files import UNFINISHED, sweep, write_text
 from raytran.data.workers import work_on
-from raytran.errors import DataError
+from raytran.errors import DataError, page
 from raytran.rooms.cad import CadModel
 from raytran.rooms.kinds import KINDS
 from raytran.rooms.shapenet_files import write_model
@@ -107,7 +107,9 @@ def import_furniture(
     """
     paths = sorted(source.rglob("*.sh3f")) if source.is_dir() else [source]
     if not paths:
-        raise DataError(f"no furniture library (*.sh3f) lies in {source}; give its folder, see docs/data.md")
+        raise DataError(
+            f"no furniture library (*.sh3f) lies in {source}; give its folder, see {page('data.md')}"
+        )
     output.mkdir(parents=True, exist_ok=True)
     sweep(output, f"{UNFINISHED}*", f"*/*/{UNFINISHED}*")
     table, jobs, licences, left_out = read_table(), [], [], dict[str, str]()

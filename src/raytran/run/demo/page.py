@@ -13,6 +13,7 @@ from PIL import Image
 
 from raytran.checkpoints.metadata import provenance
 from raytran.data.images import decode_image
+from raytran.errors import page
 from raytran.pictures.curves import draw_curves
 from raytran.pictures.page import data_uri
 from raytran.pictures.page import write_page as fill_template
@@ -130,7 +131,7 @@ def _split(column: str, metrics: Mapping[str, Mapping[str, Any]]) -> dict[str, A
         f"{_scenes(metrics, 'train')}) cannot teach what furniture looks like in general, so low numbers are "
         "expected; many more are needed for that.",
         "shipped": "The same held-out rooms, asked of the weights that come with raytran. They learned from "
-        "a thousand other rooms on two CPU cores; docs/results.md tells what to expect of them.",
+        f"a thousand other rooms on two CPU cores; {page('results.md')} tells what to expect of them.",
     }
     per_class = metrics[column]["strict"]["per_class"]
     return {

@@ -31,6 +31,7 @@ from raytran.export.torch_program import SUFFIX as PROGRAM_SUFFIX
 from raytran.export.torch_program import export_program
 from raytran.heads.score_scaling import ScoreScaling
 from raytran.run.evaluate.results import MARKER
+from raytran.run.export.model_card import card_beside, write_card
 from raytran.run.plan.camera_paths import walk
 from raytran.run.train.build import plain
 
@@ -47,8 +48,8 @@ def export_model(cfg: DictConfig) -> Path | None:
         The file that was written, None if there was only to say what is in the checkpoint.
 
     Raises:
-        ConfigError: a setting is unknown, ``output`` is the checkpoint itself or a folder, or ``calibration``
-            is no evaluation of it.
+        ConfigError: a setting is unknown, ``output`` is the checkpoint itself or a folder, ``calibration`` is no
+            evaluation of it, or there is a page where the card belongs.
         CheckpointError: the checkpoint is missing or damaged, or the file cannot be written.
     """
     source = checkpoint_path(cfg.checkpoint)
@@ -57,6 +58,7 @@ def export_model(cfg: DictConfig) -> Path | None:
         return None
     output = Path(cfg.output)
     _check_output(source, output)
+    card = card_beside(output) if cfg.card else None
     checkpoint = read_checkpoint(source)
     if cfg.calibration is not None:
         checkpoint = calibrated(checkpoint, source, Path(cfg.calibration))
@@ -64,9 +66,14 @@ def export_model(cfg: DictConfig) -> Path | None:
     model = model_from(checkpoint, source, trust=trusted_packages(cfg.trust))
     if output.suffix == SUFFIX:
         export_weights(checkpoint, source, output, dtype=cfg.dtype)
+        if card is not None:
+            write_card(card, output, facts(read_checkpoint(output), output))
+            _log.info("wrote %s", card.resolve())
     else:
         if cfg.dtype != "float32":
             raise ConfigError(f"dtype={cfg.dtype} is for {SUFFIX}: a program computes in float32")
+        if card is not None:
+            raise ConfigError(f"card=true is for {SUFFIX}: hubs offer weights, not programs")
         cameras = walk(_VIEWS_TRIED).scaled_to(prediction_settings(source).image_size)
         export_program(model, checkpoint, output, cameras=cameras, **plain(cfg.program))
     _log.info("wrote %s: %.1f MB", output.resolve(), output.stat().st_size / 1e6)
@@ -105,15 +112,15 @@ def calibrated(checkpoint: Mapping[str, Any], source: Path, evaluation: Path) ->
     return {**checkpoint, "model": {**checkpoint["model"], "score_scaling": whole.settings()}}
 
 
-def described(checkpoint: Mapping[str, Any], path: Path) -> Table:
-    """Return what a checkpoint says of itself, for the terminal."""
+def facts(checkpoint: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """Return what a checkpoint says of itself, by name; None where it says nothing."""
     weights = [value for name, value in checkpoint["state_dict"].items() if name.startswith(PREFIX)]
     dtypes = sorted(
         {str(value.dtype).removeprefix("torch.") for value in weights if value.is_floating_point()}
     )
     views, versions = checkpoint["views"], checkpoint.get("versions") or {}
     parent, classes = checkpoint.get("parent") or {}, classes_of(checkpoint)
-    rows = {
+    return {
         "size": f"{path.stat().st_size / 1e6:.1f} MB",
         "preset": checkpoint["preset"],
         "stage": checkpoint["stage"],
@@ -134,10 +141,14 @@ def described(checkpoint: Mapping[str, Any], path: Path) -> Table:
             if _is_summary(name, classes)
         },
     }
+
+
+def described(checkpoint: Mapping[str, Any], path: Path) -> Table:
+    """Return what a checkpoint says of itself, for the terminal."""
     # What a file says may look like Rich's markup.
     table = Table("", "", title=escape(str(path)), show_header=False)
     table.columns[1].overflow = "fold"
-    for name, value in rows.items():
+    for name, value in facts(checkpoint, path).items():
         if value is not None:
             table.add_row(escape(name), f"{value:.4g}" if isinstance(value, float) else escape(str(value)))
     return table

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import argparse
+from importlib import import_module
+
+import pytest
+from hydra._internal.utils import get_args_parser
+
+from raytran.run.lazy_help import let_help_be_lazy, without_look
+
+
+@pytest.fixture
+def looking(monkeypatch):
+    """argparse as of Python 3.14, whatever Python this is: it looks whether a help has a sign of formats."""
+    looked = []
+
+    def check(parser, action):
+        looked.append(action.dest)
+        if action.help and "%" in action.help:
+            raise ValueError("badly formed help string")
+
+    def add_argument(parser, *names, **what):
+        action = argparse._ActionsContainer.add_argument(parser, *names, **what)
+        parser._check_help(action)
+        return action
+
+    monkeypatch.setattr(argparse.ArgumentParser, "_check_help", check, raising=False)
+    monkeypatch.setattr(argparse.ArgumentParser, "add_argument", add_argument, raising=False)
+    return looked
+
+
+def test_hydra_makes_its_command_line_where_argparse_looks(looking, monkeypatch):
+    main = import_module("hydra.main")
+    monkeypatch.setattr(main, "get_args_parser", get_args_parser)
+    with pytest.raises(TypeError, match="LazyCompletionHelp"):
+        main.get_args_parser()
+    let_help_be_lazy()
+    let_help_be_lazy()
+    looking.clear()
+    assert main.get_args_parser().parse_args(["--cfg", "job", "a=1"]).overrides == ["a=1"]
+    assert looking == []
+    assert main.get_args_parser.__wrapped__ is get_args_parser, "wrapped once"
+
+
+def test_other_command_lines_are_looked_at_as_before(looking):
+    def fails():
+        raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        without_look(fails)()
+    with pytest.raises(ValueError, match="badly formed"):
+        argparse.ArgumentParser().add_argument("--x", help="100 %")
