@@ -66,7 +66,12 @@ class Inputs:
     def prediction(self, count: int = 6) -> ScenePrediction:
         center, seen = torch.zeros(3).to(self._device), (9 * self.random(*RESOLUTION)).int()
         return ScenePrediction(
-            "a", self.objects(count), center, occupancy=self.random(*RESOLUTION), seen=seen
+            "a",
+            self.objects(count),
+            center,
+            occupancy=self.random(*RESOLUTION),
+            seen=seen,
+            grid_extent=EXTENT,
         )
 
     def cameras(self, *lead: int) -> Cameras:
@@ -121,7 +126,7 @@ def merged(at: Inputs):
 
 
 def counted(at: Inputs):
-    return count_object_views(at.prediction(), grid_extent=EXTENT).num_views
+    return count_object_views(at.prediction()).num_views
 
 
 def meshed(at: Inputs):
@@ -244,7 +249,7 @@ def test_duplicates_are_waited_for_once_however_many_there_are():
 def test_views_of_objects_are_counted_without_a_wait():
     scene = Inputs(DEVICE).prediction()
     with recorded() as seen:
-        count_object_views(scene, grid_extent=EXTENT)
+        count_object_views(scene)
     assert not seen.waits, seen
 
 

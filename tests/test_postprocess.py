@@ -32,7 +32,7 @@ def prediction(label, center, score, *, size=(1.0, 1.0, 1.0), yaw=0.0, shape=Non
         score=torch.tensor(score),
         shape=shape,
     )
-    return ScenePrediction("scene", objects, torch.zeros(3))
+    return ScenePrediction("scene", objects, torch.zeros(3), grid_extent=(4.0, 4.0, 4.0))
 
 
 def test_threshold_is_inclusive_and_scores_are_sorted():
@@ -102,16 +102,16 @@ def test_views_of_an_object_are_the_mean_over_its_box():
         [1.0] * 4,
         size=(1.0, 1.0, 1.0),
     )
-    objects = count_object_views(replace(scene, seen=seen), grid_extent=(4.0, 4.0, 4.0))
+    objects = count_object_views(replace(scene, seen=seen))
     # Wholly where ten looked, half, not, and half out of the volume.
     assert objects.num_views.tolist() == [10, 5, 0, 5]
-    assert count_object_views(scene, grid_extent=(4.0, 4.0, 4.0)).num_views is None
+    assert count_object_views(scene).num_views is None
     none = replace(scene, objects=ObjectSet.empty(), seen=seen)
-    assert len(count_object_views(none, grid_extent=(4.0, 4.0, 4.0)).num_views) == 0
+    assert len(count_object_views(none).num_views) == 0
     # Turned by 90°, a long box lies along y.
     long = prediction([0], [0.0, 0, 0], [1.0], size=(4.0, 0.1, 0.1), yaw=np.pi / 2)
     seen = torch.arange(4, dtype=torch.int32)[None, :, None].expand(4, 4, 4)
-    objects = count_object_views(replace(long, seen=seen), grid_extent=(4.0, 4.0, 4.0))
+    objects = count_object_views(replace(long, seen=seen))
     assert objects.num_views.tolist() == [1.5]
 
 

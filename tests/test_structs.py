@@ -11,7 +11,7 @@ import torch
 
 from raytran.classes import PAPER_CLASSES, Classes
 from raytran.errors import DataError
-from raytran.structs import ObjectSet
+from raytran.structs import ObjectSet, ScenePrediction
 
 CLASSES = Classes(("drill", "lathe", "bench"))
 
@@ -63,3 +63,22 @@ def test_sets_of_different_classes_cannot_be_joined() -> None:
         match="cannot stand in one set with objects of 9 classes with 'bathtub' and without 'drill'",
     ):
         ObjectSet.join([some(0), some(0, classes=PAPER_CLASSES)])
+
+
+def test_a_prediction_is_printed_as_a_table_of_its_objects() -> None:
+    objects = replace(some(2, 0), center=torch.tensor([[1.0, -2.0, 0.25], [0.0, 0.0, 0.0]]))
+    objects = replace(objects, size=torch.full((2, 3), 0.5), score=torch.tensor([0.9, 0.625]))
+    scene = ScenePrediction("workshop", objects, torch.zeros(3), occupancy=torch.zeros(4, 4, 2))
+    first, head, bench, drill, rest = repr(scene).splitlines()
+    assert first == "ScenePrediction workshop: 2 objects"
+    assert head.split()[:3] == ["class", "score", "centre"]
+    assert " ".join(bench.split()) == "00 bench 0.90 1.00 -2.00 0.25 0.50 x 0.50 x 0.50"
+    assert drill.split()[:3] == ["01", "drill", "0.62"]
+    assert rest == "  with occupancy 4 x 4 x 2"
+    assert "tensor(" not in repr(scene) + repr(objects)
+    assert repr(replace(scene, objects=ObjectSet.empty(CLASSES), occupancy=None)).endswith(
+        "workshop: 0 objects"
+    )
+    many = repr(some(*[0] * 240))
+    assert len(many.splitlines()) == 103
+    assert many.endswith("and 140 more")

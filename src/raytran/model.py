@@ -381,6 +381,7 @@ class RayTran(nn.Module):
                 occupancy=None if raw.occupancy is None else raw.occupancy[scene].float().sigmoid(),
                 foreground=None if raw.foreground is None else raw.foreground[scene].float().sigmoid(),
                 new_views=None if raw.new_views is None else raw.new_views[scene].float().sigmoid(),
+                grid_extent=self.grid_extent,
             )
             for scene, scene_id in enumerate(scene_ids)
         )

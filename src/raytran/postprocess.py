@@ -10,6 +10,7 @@ import numpy as np
 import torch
 import trimesh
 from numpy.typing import NDArray
+from scipy import ndimage
 from skimage.measure import marching_cubes
 from torch import Tensor
 
@@ -34,6 +35,9 @@ class, the second whatever they are."""
 
 _OBJECTS_AT_ONCE = 256
 """Objects that are compared with all others together, so that memory grows with their number."""
+
+_SPECK = 8
+"""A piece of a shape of fewer cells is noise, unless it is the largest, and so is a hollow inside of one."""
 
 _NEARLY_OWN = 0.25
 """How far on another volume's side of the border an object still counts, if nothing else is there, metres."""
@@ -103,21 +107,20 @@ def _first_of(objects: ObjectSet, duplicates: Callable[[slice, slice], Tensor]) 
     return torch.tensor(kept, dtype=torch.int64, device=objects.label.device)
 
 
-def count_object_views(prediction: ScenePrediction, *, grid_extent: tuple[float, float, float]) -> ObjectSet:
+def count_object_views(prediction: ScenePrediction) -> ObjectSet:
     """Return the objects with the number of views that saw their boxes, the mean over points in each box.
 
     Args:
-        prediction: with ``seen``; places outside the voxel grid count as unseen.
-        grid_extent: sizes of the voxel grid, metres.
+        prediction: with ``seen`` and ``grid_extent``; places outside the voxel grid count as unseen.
     """
     objects, seen = prediction.objects, prediction.seen
-    if seen is None:
+    if seen is None or prediction.grid_extent is None:
         return objects
     side = (torch.arange(_POINTS_PER_SIDE, device=objects.size.device) + 0.5) / _POINTS_PER_SIDE - 0.5
     local = torch.cartesian_prod(side, side, side).to(objects.size.dtype) * objects.size[:, None]
     points = local @ objects.rotation.transpose(1, 2) + objects.center[:, None]
     x, y, z = seen.shape
-    grid = VoxelGrid((x, y, z), grid_extent, prediction.grid_center.to(points))
+    grid = VoxelGrid((x, y, z), prediction.grid_extent, prediction.grid_center.to(points))
     voxel = grid.voxel_from_world(points.flatten(0, 1)).floor().long()
     axes = zip(voxel.unbind(dim=1), seen.shape, strict=True)
     inside = torch.stack([(index >= 0) & (index < count) for index, count in axes]).all(dim=0)
@@ -168,6 +171,7 @@ def merge_volumes(predictions: Sequence[ScenePrediction], volumes: Volumes) -> S
         grid_center=volumes.joint().center.to(predictions[0].grid_center),
         occupancy=_join_voxels([prediction.occupancy for prediction in predictions], volumes),
         seen=_join_voxels([prediction.seen for prediction in predictions], volumes),
+        grid_extent=volumes.joint().extent,
     )
 
 
@@ -195,7 +199,8 @@ def _join_voxels(values: Sequence[Tensor | None], volumes: Volumes) -> Tensor | 
 def object_meshes(prediction: ScenePrediction) -> list[trimesh.Trimesh | None]:
     """Return the surface of each object's shape, in the world.
 
-    Marching cubes (Lewiner) at probability ½ on the shape grid, whose cells fill the object's box.
+    Marching cubes (Lewiner) at probability ½ on the shape grid, whose cells fill the object's box, without
+    loose pieces and closed hollows of fewer than eight cells.
 
     Returns:
         One mesh for each object, in metres, faces counter-clockwise from outside; None where the shape is
@@ -225,6 +230,21 @@ def _unit_surface(probability: NDArray[np.float32]) -> tuple[NDArray[np.float64]
         return None
     # One layer of empty cells around the grid closes a shape that reaches the sides of its box.
     # "ascent": values grow towards the object, which makes its faces counter-clockwise from outside.
-    padded = np.pad(probability, 1)
+    padded = _without_specks(np.pad(probability, 1))
     vertices, faces, _, _ = marching_cubes(padded, level=0.5, method="lewiner", gradient_direction="ascent")
     return (vertices.astype(np.float64) - 0.5) / probability.shape[0] - 0.5, faces.astype(np.int64)
+
+
+def _without_specks(probability: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return probabilities in which small pieces, and small hollows, are just below, and above, one half."""
+    solid = probability > 0.5
+    pieces, _ = ndimage.label(solid)
+    cells = np.bincount(pieces.ravel())
+    # Number 0 is everything else. The largest piece stays; the space around is at least 26 cells.
+    cells[0] = _SPECK
+    cells[1:][cells[1:].argmax()] = _SPECK
+    hollows, _ = ndimage.label(~solid)
+    holes = np.bincount(hollows.ravel())
+    holes[0] = _SPECK
+    cleaned = np.where((cells < _SPECK)[pieces], np.float32(0.499), probability)
+    return np.where((holes < _SPECK)[hollows], np.float32(0.501), cleaned)

@@ -82,6 +82,7 @@ _NUMBERS: dict[str, Quantity] = {
     **dict.fromkeys(("brightness", "contrast", "saturation"), SHARE),
     **dict.fromkeys(("yaw_deg", "hue_deg"), _DEGREES),
     "shift": Quantity("a length in metres", 0, 1e4),
+    "mesh_error": Quantity("a length in metres", 0, 1),
     "weights": _FACTOR,
     **dict.fromkeys(("no_object_weight", "parent_minimum"), _FACTOR),
     **dict.fromkeys(("center_beta", "yaw_beta"), _POSITIVE),

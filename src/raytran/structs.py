@@ -20,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import lru_cache, wraps
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import torch
@@ -30,6 +31,9 @@ from raytran.errors import DataError
 
 SHAPE_SIZE: int = 63
 """Cells along each side of an object's shape grid (RayTran §3.2)."""
+
+_MOST_LINES = 100
+"""Objects of a set that are printed."""
 
 SYMMETRY_INFINITE: int = 0
 """Value of ``ObjectSet.symmetry`` for a body of revolution; 1, 2 and 4 are the number of equal turns."""
@@ -198,7 +202,7 @@ class Views(TensorStruct):
         return rgb if rgb.is_floating_point() else rgb.float() / 255
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ObjectSet(TensorStruct):
     """The ``M`` objects of one scene, true or predicted, in the world of the scene's poses.
 
@@ -231,6 +235,24 @@ class ObjectSet(TensorStruct):
 
     def __len__(self) -> int:
         return int(self.label.shape[0])
+
+    def __repr__(self) -> str:
+        """Return a line for each object, and no tensors; on a GPU the host waits for them."""
+        count = "1 object" if len(self) == 1 else f"{len(self)} objects"
+        if not len(self):
+            return count
+        width = max(len(name) for name in self.category)
+        lines = [
+            f"{count}\n      {'class':{width}}  score   centre x, y, z in m       width x height x depth in m"
+        ]
+        numbers = torch.cat([self.score[:, None], self.center, self.size], dim=1).tolist()
+        for i, (name, (score, x, y, z, *size)) in enumerate(zip(self.category, numbers, strict=True)):
+            if i == _MOST_LINES:
+                lines.append(f"  and {len(self) - i} more")
+                break
+            sides = " x ".join(f"{length:.2f}" for length in size)
+            lines.append(f"  {i:02d}  {name:{width}}  {score:5.2f}  {x:7.2f} {y:7.2f} {z:7.2f}    {sides}")
+        return "\n".join(lines)
 
     @property
     def category(self) -> tuple[str, ...]:
@@ -449,9 +471,11 @@ class RawScene(TensorStruct):
     voxels: Tensor | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ScenePrediction(TensorStruct):
     """The result for one scene.
+
+    The objects' class names are ``objects.category``; printed, it is a table.
 
     Attributes:
         scene_id: name of the scene.
@@ -461,6 +485,7 @@ class ScenePrediction(TensorStruct):
         foreground: ``(N, H, W)`` probability, or None.
         seen: ``(X, Y, Z)`` int32, how many views have a ray through each voxel, or None.
         new_views: ``(V, 3, H, W)`` rendered colours in [0, 1], or None.
+        grid_extent: sizes of the voxel grid, metres, or None if there are no voxels.
     """
 
     scene_id: str
@@ -470,3 +495,61 @@ class ScenePrediction(TensorStruct):
     foreground: Tensor | None = None
     seen: Tensor | None = None
     new_views: Tensor | None = None
+    grid_extent: tuple[float, float, float] | None = None
+
+    def __repr__(self) -> str:
+        """Return the objects, a line each, and what else there is; on a GPU the host waits for them."""
+        has = [
+            f"{name} {' x '.join(map(str, value.shape))}"
+            for name in ("occupancy", "foreground", "seen", "new_views")
+            if (value := getattr(self, name)) is not None
+        ]
+        if self.objects.shape is not None:
+            has.insert(0, f"shapes of {self.objects.shape.shape[-1]} cells a side")
+        name = f"ScenePrediction {self.scene_id}".rstrip()
+        return f"{name}: {self.objects!r}" + (f"\n  with {', '.join(has)}" if has else "")
+
+    def save(
+        self,
+        folder: str | Path,
+        views: Views | None = None,
+        *,
+        frame_ids: Sequence[str] = (),
+        mesh_error: float = 0.01,
+        obj: bool = False,
+    ) -> Path:
+        """Write the files of ``python -m raytran.predict`` (docs/outputs.md), all or nothing.
+
+        Args:
+            folder: replaced if it is an earlier result.
+            views: B = 1, what was given to ``predict``. Without them there are no pictures of the frames, and
+                no cameras in the plan and in ``scene.glb``.
+            frame_ids: name of each view; by default their numbers.
+            mesh_error: farthest that a mesh may lie from the surface of its shape, metres; 0: every triangle.
+            obj: write each mesh as OBJ too.
+
+        Returns:
+            ``folder``.
+
+        Raises:
+            ConfigError: ``folder`` holds something that is no earlier result, or ``mesh_error`` is no length.
+            ShapeError: there are not as many names as views.
+        """
+        # Imported here: this and `show` reach right, as `raytran.load` does, when they are called.
+        from raytran.run.predict.write_scene import save_prediction
+
+        return save_prediction(Path(folder), self, views, frame_ids=frame_ids, mesh_error=mesh_error, obj=obj)
+
+    def show(self, views: Views | None = None, *, height: int = 600) -> None:
+        """Show it in a notebook, to turn and zoom; elsewhere in a new page of the browser.
+
+        Args:
+            views: B = 1, what was given to ``predict``, to see the frames too.
+            height: of the picture in the notebook, pixels.
+
+        Raises:
+            ConfigError: viser is not installed (``pip install 'raytran[viewer]'``).
+        """
+        from raytran.run.predict.write_scene import show_prediction
+
+        show_prediction(self, views, height=height)

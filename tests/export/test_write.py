@@ -54,20 +54,47 @@ def test_scene_json_reads_back(tmp_path, prediction):
     write_prediction(tmp_path, prediction, [None, None])
     read = read_scene_json(tmp_path / "scene.json")
     assert read.scene_id == "scene0000_00"
-    for name in ("label", "center", "size", "rotation", "score"):
-        assert torch.equal(getattr(read.objects, name), getattr(prediction.objects, name)), name
+    assert torch.equal(read.objects.label, prediction.objects.label)
+    # Rounded to a tenth of a millimetre, and to a millionth of a turn or a share.
+    for name, most in {"center": 6e-5, "size": 6e-5, "rotation": 6e-7, "score": 6e-7}.items():
+        written, meant = getattr(read.objects, name), getattr(prediction.objects, name)
+        torch.testing.assert_close(written, meant.double(), rtol=0, atol=most)
     assert read.objects.model_id == ("03001627/abc", "")
 
 
+def test_scene_json_has_a_line_for_each_object_and_the_digits_that_mean_something(tmp_path, prediction):
+    objects = replace(
+        prediction.objects,
+        center=torch.tensor([[1 / 3, -1e-9, 12.3456789], [2.0, 3.0, 4.0]]),
+        score=torch.tensor([0.9876543, 0.5]),
+    )
+    path = write_scene_json(tmp_path / "scene.json", replace(prediction, objects=objects), [None, None])
+    lines = path.read_text().splitlines()
+    assert len(lines) == 5
+    assert lines[0].startswith(
+        '{"format": "raytran.scene/1", "scene_id": "scene0000_00", "up": "+z", "unit": "m",'
+    )
+    assert '"center": [0.3333, 0.0, 12.3457]' in lines[2]
+    assert '"score": 0.987654,' in lines[2]
+    assert [entry["category"] for entry in json.loads(path.read_text())["objects"]] == ["chair", "table"]
+    empty = write_scene_json(tmp_path / "empty.json", replace(prediction, objects=ObjectSet.empty()), [])
+    assert json.loads(empty.read_text())["objects"] == []
+
+
+def test_without_asking_there_is_one_file_a_mesh(tmp_path, prediction, box_at):
+    write_meshes(tmp_path, prediction.objects, [box_at([1, 2, 0.5]), None])
+    assert [path.name for path in (tmp_path / "meshes").iterdir()] == ["00.ply"]
+
+
 def test_every_file_is_there_and_named(tmp_path, prediction, box_at, cameras):
-    known = replace(prediction, occupancy=torch.rand(4, 4, 2))
+    known = replace(prediction, occupancy=torch.rand(4, 4, 2), grid_extent=(4.0, 4.0, 2.0))
     files = write_prediction(
         tmp_path,
         known,
         [None, box_at([-1, 0, 0.5])],
         cameras=cameras,
         frame_ids=["0", "5"],
-        grid_extent=(4.0, 4.0, 2.0),
+        obj=True,
     )
     assert files[0] == tmp_path / "scene.json"
     below = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
@@ -122,7 +149,7 @@ def test_damaged_files_are_named(tmp_path, content, message):
 
 
 def test_files_of_a_mesh_hold_the_same_mesh_in_the_world(tmp_path, prediction, box_at):
-    names = write_meshes(tmp_path, prediction.objects, [box_at([1, 2, 0.5]), None])
+    names = write_meshes(tmp_path, prediction.objects, [box_at([1, 2, 0.5]), None], obj=True)
     assert names == ["meshes/00.ply", None]
     assert {path.name for path in (tmp_path / "meshes").iterdir()} == {"00.ply", "00.obj", "00.mtl"}
     ply = trimesh.load(tmp_path / "meshes" / "00.ply", process=False)

@@ -57,9 +57,11 @@ def test_north_is_up_and_east_is_right(tmp_path):
 def test_truth_and_occupancy_and_an_empty_prediction(tmp_path):
     occupancy = torch.zeros(8, 8, 4)
     occupancy[6:, 6:, 0] = 1.0
-    nothing = ScenePrediction("room", ObjectSet.empty(), torch.zeros(3), occupancy=occupancy)
+    nothing = ScenePrediction(
+        "room", ObjectSet.empty(), torch.zeros(3), occupancy=occupancy, grid_extent=(6.0, 6.0, 3.0)
+    )
     truth = objects((5, (-2.0, -1.5, 0.4), (1.0, 0.8, 0.8)), (6, (2.5, 2.5, 0.4), (1.0, 0.8, 0.8)))
-    options = {"truth": truth, "cameras": cameras(), "grid_extent": (6.0, 6.0, 3.0)}
+    options = {"truth": truth, "cameras": cameras()}
     path = draw_topdown(tmp_path / "topdown.png", nothing, **options)
     image = np.asarray(Image.open(path).convert("RGB")).astype(int)
     assert centre_of(image, (214, 39, 40))[0] > image.shape[0] / 2, "the true sofa lies in the south"

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from PIL import Image
+from PIL import Image, ImageDraw
 
 from raytran.classes import PAPER_CLASSES
 from raytran.geometry.camera import Cameras
@@ -15,6 +15,7 @@ from raytran.pictures.turntable import SIZE, draw_turntable, turntable_frames
 from raytran.structs import ObjectSet
 
 CHAIR, SOFA = 3, 5
+LEGEND = 30
 UPRIGHT = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
 
@@ -42,8 +43,8 @@ def walk() -> Cameras:
 
 
 def pixels_of(picture: Image.Image, label: int) -> np.ndarray:
-    """Return ``(n, 2)`` row and column of the pixels in the hue of a class."""
-    values = np.asarray(picture).astype(float)
+    """Return ``(n, 2)`` row and column of the pixels above the legend in the hue of a class."""
+    values = np.asarray(picture).astype(float)[:-LEGEND]
     color = np.array(PAPER_CLASSES.colors[label], dtype=float)
     # By direction in RGB, as light scales it.
     cosine = (values @ color) / np.linalg.norm(values, axis=-1).clip(1) / np.linalg.norm(color)
@@ -88,6 +89,18 @@ def test_a_mesh_hides_the_box_behind_it(walk):
     north, south = turntable_frames(room, [None, screen], cameras=walk, num_frames=2)
     assert len(pixels_of(north, CHAIR)) > 50
     assert len(pixels_of(south, CHAIR)) == 0
+
+
+def test_the_legend_counts_the_classes_in_their_colours(walk, monkeypatch):
+    written = []
+    draw = ImageDraw.ImageDraw.text
+    monkeypatch.setattr(ImageDraw.ImageDraw, "text", lambda *a, **k: (written.append(a[2]), draw(*a, **k))[1])
+    room = objects(*[(CHAIR, [x, 0, 0.4], [0.4] * 3) for x in (-1.0, 1.0)], (SOFA, [0, 0, 0.4], [0.4] * 3))
+    (picture,) = turntable_frames(room, [None] * 3, cameras=walk, num_frames=1)
+    assert sorted(written) == ["1 sofa", "2 chair"]
+    strip = np.asarray(picture)[-LEGEND:]
+    for label in (CHAIR, SOFA):
+        assert (strip == PAPER_CLASSES.colors[label]).all(axis=-1).sum() > 40
 
 
 def test_the_file_is_one_loop(tmp_path, walk):

@@ -49,9 +49,7 @@ def model():
 def test_what_voxels_read_is_told_the_same_in_chunks(model):
     views = make_views(1, 3)
     whole, chunked = (
-        predicted_volumes(
-            model, views, *predict(model, views, views_at_once=at_once), grid_extent=model.grid_extent
-        )[0]
+        predicted_volumes(model, views, *predict(model, views, views_at_once=at_once))[0]
         for at_once in (None, 2)
     )
     assert whole.grid.resolution == tuple(whole.occupancy.shape) == model.grid_resolution
@@ -77,9 +75,7 @@ def test_volumes_of_a_large_room_each_say_what_they_read(model):
                 views.images[:, frames], views.intrinsics[:, frames], views.world_from_camera[:, frames]
             )
             prediction = model.predict(some, with_shapes=False, grid_center=center)
-    whole, *tiles = predicted_volumes(
-        model, views, prediction, observed, grid_extent=model.grid_extent, parts=parts
-    )
+    whole, *tiles = predicted_volumes(model, views, prediction, observed, parts=parts)
     assert whole.reads is None
     assert [list(tile.frames) for tile in tiles] == [[0, 1, 2], [3, 2]]
     assert [tile.grid.center.tolist() for tile in tiles] == [center.tolist() for center in centers]
@@ -90,7 +86,7 @@ def test_volumes_of_a_large_room_each_say_what_they_read(model):
 def test_a_network_without_rays_has_voxels_all_the_same(model):
     views = make_views(1, 2)
     prediction, _ = predict(model, views)
-    (volume,) = predicted_volumes(model, views, prediction, None, grid_extent=model.grid_extent)
+    (volume,) = predicted_volumes(model, views, prediction, None)
     assert volume.reads is None
 
 
@@ -124,7 +120,7 @@ def test_pictures_of_filled_up_frames_come_back(tmp_path):
 def test_a_voxel_of_a_filled_up_frame_reads_nothing_beside_its_picture(model):
     views = make_views(1, 3)
     part = replace(views, picture=torch.tensor([16.0, 0.0, 32.0, 32.0]).repeat(1, 3, 1))
-    (volume,) = predicted_volumes(model, part, *predict(model, part), grid_extent=model.grid_extent)
+    (volume,) = predicted_volumes(model, part, *predict(model, part))
     read = np.diff(volume.reads.offsets).reshape(model.grid_resolution) > 0
     assert np.array_equal(volume.view_count.numpy() > 0, read)
     columns = [volume.reads.of_voxel(v).column for v in np.flatnonzero(read.ravel())]

@@ -6,6 +6,7 @@ import socket
 import urllib.request
 
 import pytest
+import rich
 
 import raytran.viewer
 from raytran.errors import ConfigError, DataError
@@ -28,6 +29,16 @@ def test_one_file_holds_the_scene_and_the_program_that_shows_it(tmp_path):
     # Nothing is loaded from elsewhere; the address of SVG's namespace is a name.
     assert set(re.findall(r"https?://[\w./-]+", page)) <= {"http://www.w3.org/2000/svg"}
     assert not re.findall(r'(?:src|href)="(?!data:)', page)
+
+
+def test_a_server_is_quiet_in_a_notebook_too(monkeypatch):
+    shown = []
+    monkeypatch.setattr("rich.jupyter.display", lambda *words, **_: shown.append(words))
+    console = rich.get_console()
+    monkeypatch.setattr(console, "is_jupyter", True)
+    with quiet_server():
+        assert not console.quiet
+    assert not shown
 
 
 def test_a_server_is_quiet_and_gives_the_page(capfd):

@@ -97,7 +97,8 @@ def _linear(color: Sequence[int]) -> list[float]:
 
 
 def _add(scene: trimesh.Scene, name: str, mesh: trimesh.Trimesh, classes: Classes, label: int) -> None:
-    solid = turned_y_up(mesh)
+    turned = turned_y_up(mesh)
+    solid = trimesh.Trimesh(turned.vertices, turned.faces, vertex_normals=_normals(turned), process=False)
     # Its colour is set in the finished file: trimesh rounds colours to 256 steps, too few for linear light.
     material = trimesh.visual.material.PBRMaterial(
         name=classes.names[label],
@@ -108,6 +109,19 @@ def _add(scene: trimesh.Scene, name: str, mesh: trimesh.Trimesh, classes: Classe
     )
     solid.visual = trimesh.visual.TextureVisuals(material=material)
     scene.add_geometry(solid, node_name=name, geom_name=name, parent_node_name=ROOT)
+
+
+def _normals(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
+    """Return the normals of vertices, the mean of their triangles' by area.
+
+    So a large flat side looks flat up to its edges, which rounds only the small triangles along them.
+    """
+    first, second, third = np.asarray(mesh.vertices)[np.asarray(mesh.faces)].swapaxes(0, 1)
+    cross = np.repeat(np.cross(second - first, third - first), 3, axis=0)
+    corner, count = np.asarray(mesh.faces).ravel(), len(mesh.vertices)
+    normal = np.stack([np.bincount(corner, axis, minlength=count) for axis in cross.T], axis=1)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    return np.where(length > 0, normal / np.where(length > 0, length, 1.0), (0.0, 1.0, 0.0))
 
 
 def _box_edges(objects: ObjectSet, index: int) -> trimesh.Trimesh:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A prediction as files: ``scene.json``, ``scene.glb``, PLY and OBJ of each object, ``occupancy.ply``."""
+"""A prediction as files: ``scene.json``, ``scene.glb``, a PLY (and OBJ) of each mesh, ``occupancy.ply``."""
 
 from __future__ import annotations
 
@@ -28,6 +28,12 @@ FORMAT = "raytran.scene/1"
 _OBJ_DECIMALS = 5
 """Digits behind the point in an OBJ: a hundredth of a millimetre."""
 
+_METRE_DECIMALS = 4
+"""Digits behind the point of lengths in ``scene.json``: a tenth of a millimetre."""
+
+_SHARE_DECIMALS = 6
+"""Digits behind the point of scores, radians and entries of rotations."""
+
 _OCCUPIED = 0.5
 """Voxels with a higher probability are points."""
 
@@ -47,7 +53,7 @@ def write_prediction(
     *,
     cameras: Cameras | None = None,
     frame_ids: Sequence[str] = (),
-    grid_extent: tuple[float, float, float] | None = None,
+    obj: bool = False,
 ) -> list[Path]:
     """Write ``scene.json``, ``scene.glb``, ``meshes/`` and ``occupancy.ply``.
 
@@ -55,12 +61,12 @@ def write_prediction(
 
     Args:
         folder: made if it is missing.
-        prediction: ``M`` objects, possibly none.
+        prediction: ``M`` objects, possibly none; without ``occupancy`` or ``grid_extent`` there is no
+            ``occupancy.ply``.
         meshes: for each object its mesh in world coordinates (metres), or None.
         cameras: ``(N,)`` cameras of the frames used, for ``scene.glb``; None: it has none.
         frame_ids: the name of each of the ``N`` frames.
-        grid_extent: sizes of the voxel grid, metres; without them, or without an occupancy, there is no
-            ``occupancy.ply``.
+        obj: write each mesh as OBJ too.
 
     Returns:
         The files, ``scene.json`` first.
@@ -78,17 +84,17 @@ def write_prediction(
             f"expected a name for each frame, got {len(frame_ids)} for {len(cameras.intrinsics)} cameras"
         )
     folder.mkdir(parents=True, exist_ok=True)
-    names = write_meshes(folder, objects, meshes)
+    names = write_meshes(folder, objects, meshes, obj=obj)
     files = [write_glb(folder / "scene.glb", objects, meshes, cameras=cameras, frame_ids=frame_ids)]
-    if (occupancy := prediction.occupancy) is not None and grid_extent is not None:
+    if (occupancy := prediction.occupancy) is not None and (extent := prediction.grid_extent) is not None:
         path, center = folder / "occupancy.ply", prediction.grid_center
-        files.append(write_occupancy(path, occupancy, center=center, extent=grid_extent))
+        files.append(write_occupancy(path, occupancy, center=center, extent=extent))
     files += [folder / name for name in names if name is not None]
     return [write_scene_json(folder / "scene.json", prediction, names), *files]
 
 
 def write_scene_json(path: Path, prediction: ScenePrediction, mesh_names: Sequence[str | None]) -> Path:
-    """Write a prediction's objects, in their order.
+    """Write a prediction's objects, in their order, a line each.
 
     ``center`` and ``rotation`` are in the world of the input poses (+Z up, metres); ``size`` and ``rotation``
     follow the object frame (x width, y height, z depth; +Y up, front -Z); ``yaw`` is in radians. Where views
@@ -108,33 +114,41 @@ def write_scene_json(path: Path, prediction: ScenePrediction, mesh_names: Sequen
     yaw, category = yaw_from_rotation(objects.rotation.double()), objects.category
     entries = []
     for i, mesh in enumerate(mesh_names):
+        score = float(objects.score[i])
         entry: dict[str, Any] = {
             "category": category[i],
-            "score": float(objects.score[i]),
-            "center": objects.center[i].tolist(),
-            "size": objects.size[i].tolist(),
-            "rotation": objects.rotation[i].tolist(),
-            "yaw": float(yaw[i]),
+            "score": round(score, _SHARE_DECIMALS),
+            "center": _rounded(objects.center[i].tolist(), _METRE_DECIMALS),
+            "size": _rounded(objects.size[i].tolist(), _METRE_DECIMALS),
+            "rotation": [_rounded(row, _SHARE_DECIMALS) for row in objects.rotation[i].tolist()],
+            "yaw": round(float(yaw[i]), _SHARE_DECIMALS),
             "mesh": mesh,
         }
         if objects.num_views is not None:
             views = float(objects.num_views[i])
-            entry |= {"num_views": round(views, 1), "confidence": entry["score"] * views / (views + 1)}
+            entry["num_views"] = round(views, 1)
+            entry["confidence"] = round(score * views / (views + 1), _SHARE_DECIMALS)
         if objects.model_id and objects.model_id[i]:
             entry["catid_cad"], entry["id_cad"] = objects.model_id[i].split("/", 1)
-        entries.append(entry)
+        entries.append(json.dumps(entry, allow_nan=False))
     content: dict[str, Any] = {"format": FORMAT, "scene_id": prediction.scene_id, "up": "+z", "unit": "m"}
     if objects.classes != PAPER_CLASSES:
         content["classes"] = objects.classes.settings()
-    content["objects"] = entries
-    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+    head = json.dumps(content, allow_nan=False)[:-1]
+    listed = "[\n  " + ",\n  ".join(entries) + "\n ]" if entries else "[]"
+    write_text(path, f'{head},\n "objects": {listed}}}\n')
     return path
 
 
+def _rounded(values: Sequence[float], decimals: int) -> list[float]:
+    """Return the numbers with so many digits behind the point, and no negative zero."""
+    return [round(value, decimals) + 0.0 for value in values]
+
+
 def write_meshes(
-    folder: Path, objects: ObjectSet, meshes: Sequence[trimesh.Trimesh | None]
+    folder: Path, objects: ObjectSet, meshes: Sequence[trimesh.Trimesh | None], *, obj: bool = False
 ) -> list[str | None]:
-    """Write ``meshes/NN.ply``, ``.obj`` and ``.mtl`` of each object that has a mesh, in place.
+    """Write ``meshes/NN.ply`` of each object that has a mesh, in place, and ``.obj`` and ``.mtl`` if wanted.
 
     The PLY is in the world (+Z up), the OBJ has its axes as readers of OBJ expect them (+Y up).
 
@@ -142,6 +156,7 @@ def write_meshes(
         folder: an existing folder.
         objects: ``M`` objects.
         meshes: for each object its mesh in world coordinates (metres, +Z up), or None.
+        obj: write OBJ too.
 
     Returns:
         For each object the name of the PLY relative to ``folder``, or None.
@@ -156,7 +171,9 @@ def write_meshes(
         label = int(objects.label[i])
         name, color = objects.classes.names[label], objects.classes.colors[label]
         _painted(mesh, color).export(folder / f"meshes/{i:02d}.ply")
-        _write_obj(folder / f"meshes/{i:02d}.obj", object_name(objects, i), mesh, material=name, color=color)
+        if obj:
+            path = folder / f"meshes/{i:02d}.obj"
+            _write_obj(path, object_name(objects, i), mesh, material=name, color=color)
     return names
 
 

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +12,16 @@ import trimesh
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from raytran.classes import Color
 from raytran.data.views import choose_even
 from raytran.geometry.camera import Cameras
 from raytran.geometry.rasterize import rasterize_ids
+from raytran.pictures.labels import place_labels
 from raytran.pictures.palette import font, ink_on
 from raytran.pictures.wireframe import box_segments
 from raytran.structs import ObjectSet, ScenePrediction, Views
+
+Segments = Sequence[tuple[float, float, float, float, bool]]
+"""Of one box, as ``box_segments`` returns them."""
 
 _FILL = 0.5
 _OVERSAMPLING = 2
@@ -110,14 +113,7 @@ def draw_objects(
             line = [_OVERSAMPLING * value for value in (u0, v0, u1, v1)]
             pen.line(line, fill=color, width=_OVERSAMPLING * (3 if front else 1) + 1)
     picture = large.resize(frame.size, Image.Resampling.BOX)
-    pen = ImageDraw.Draw(picture)
-    for m in far_first:
-        label = int(objects.label[m])
-        text, color = (
-            f"{objects.classes.names[label]} {float(objects.score[m]):.2f}",
-            objects.classes.colors[label],
-        )
-        _write_name(pen, frame.size, segments[m], text, color)
+    _write_names(picture, objects, segments, reversed(far_first))
     return picture
 
 
@@ -156,24 +152,30 @@ def headlight(depth: Tensor, directions: Tensor) -> Tensor:
     return (0.55 + 0.55 * (normal * sight).sum(dim=-1).abs()).float()
 
 
-def _write_name(
-    pen: ImageDraw.ImageDraw,
-    size: tuple[int, int],
-    segments: Sequence[tuple[float, float, float, float, bool]],
-    text: str,
-    color: Color,
+def _write_names(
+    picture: Image.Image, objects: ObjectSet, segments: Sequence[Segments], near_first: Iterable[int]
 ) -> None:
-    ends = np.array([end for u0, v0, u1, v1, _ in segments for end in ((u0, v0), (u1, v1))]).reshape(-1, 2)
-    low, high = (
-        (ends.min(axis=0), ends.max(axis=0)) if len(ends) else (np.full(2, np.inf), np.full(2, -np.inf))
-    )
-    width, height = size
-    if low[0] >= width or low[1] >= height or high[0] <= 0 or high[1] <= 0:
-        return
-    type_face = font(max(13, height // 26))
-    left, top, right, bottom = pen.textbbox((0, 0), text, font=type_face)
-    middle = (max(low[0], 0) + min(high[0], width)) / 2
-    x = float(np.clip(middle - (right - left) / 2, 2, max(width - (right - left) - 4, 2)))
-    y = float(np.clip(low[1] - (bottom - top) - 4, 2, height - (bottom - top) - 4))
-    pen.rectangle([x - 2, y - 1, x + right - left + 2, y + bottom - top + 3], fill=color)
-    pen.text((x - left, y - top + 1), text, font=type_face, fill=ink_on(color))
+    """Write the names of objects above their boxes, none on another and all in the picture."""
+    pen, (width, height) = ImageDraw.Draw(picture), picture.size
+    letters = font(max(13, height // 26))
+    shown, anchors, sizes = [], [], []
+    for m in near_first:
+        ends = np.array([line[:4] for line in segments[m]]).reshape(-1, 2)
+        if not len(ends):
+            continue
+        low, high = ends.min(axis=0), ends.max(axis=0)
+        if low[0] >= width or low[1] >= height or high[0] <= 0 or high[1] <= 0:
+            continue
+        text = f"{objects.category[m]} {float(objects.score[m]):.2f}"
+        box = pen.textbbox((0, 0), text, font=letters)
+        wide, tall = box[2] - box[0] + 6, box[3] - box[1] + 6
+        shown.append((m, text, box))
+        sizes.append((wide, tall))
+        anchors.append(((max(low[0], 0) + min(high[0], width)) / 2, low[1] - tall / 2))
+    for (m, text, box), (wide, tall), (x, y) in zip(
+        shown, sizes, place_labels(anchors, sizes, (1, 1, width - 1, height - 1)), strict=True
+    ):
+        color = objects.classes.colors[int(objects.label[m])]
+        left, top = x - wide / 2, y - tall / 2
+        pen.rectangle([left, top, left + wide, top + tall], fill=color)
+        pen.text((left + 3 - box[0], top + 3 - box[1]), text, font=letters, fill=ink_on(color))

@@ -58,7 +58,6 @@ def draw_scene(
             prediction,
             truth=batch.objects[0],
             cameras=Cameras.of(batch.views.scene()),
-            grid_extent=grid_extent,
         )
         pictures["boxes"] = _draw_boxes(folder / "boxes.jpg", batch, prediction)
     return pictures

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -18,27 +19,33 @@ from torch import Tensor
 from raytran.geometry.camera import Cameras, pose_from_heading
 from raytran.geometry.rasterize import rasterize_ids
 from raytran.pictures.overlay import headlight
+from raytran.pictures.palette import INK, font
 from raytran.pictures.wireframe import NEAR, box_corners, box_edges
 from raytran.structs import ObjectSet
 
-SIZE = (360, 480)
+SIZE = (448, 720)
 """Rows and columns of the picture."""
 
 _FINER = 2
 """Lines are drawn on a picture this many times as large, which smooths them."""
 
-_FIELD_OF_VIEW = math.radians(35)
+_DISTANCE = 3.0
+"""Of the camera from the middle, in units of the distance of the farthest point."""
+
 _DOWN = math.radians(35)
 """How far the camera looks down."""
 
-_FILLED = 0.92
+_FILLED = 0.96
 """Share of the picture that what is shown may fill."""
 
-_NEAREST = 2.0
-"""Least distance of the camera from the middle, metres."""
+_SMALLEST = 0.7
+"""Least distance of the farthest point from the middle, metres: a single small thing stays small."""
 
 _MILLISECONDS = 120
 _PAPER, _FLOOR, _PATH = (255, 255, 255), (221, 225, 231), (138, 148, 163)
+
+_LETTERS = 13
+"""Height of the legend's letters, pixels."""
 
 _PIECES = 48
 """Pieces of a line, each drawn if nothing lies before its middle."""
@@ -60,7 +67,7 @@ def draw_turntable(
     objects: ObjectSet,
     meshes: Sequence[trimesh.Trimesh | None],
     *,
-    cameras: Cameras,
+    cameras: Cameras | None,
     num_frames: int = 24,
 ) -> Path:
     """Write an animated GIF of one turn around the objects.
@@ -68,13 +75,13 @@ def draw_turntable(
     The first picture looks north (+y), as the plan does; then the camera goes clockwise as seen from above.
 
     Meshes are solid, boxes are wireframes with a bold front, both in class colours; the squares of the floor
-    have sides of 1 m, the grey line is the path of the cameras.
+    have sides of 1 m, the grey line is the path of the cameras, which may leave the picture.
 
     Args:
         path: the file.
         objects: ``M`` objects, possibly none.
         meshes: for each object its mesh in world coordinates, or None.
-        cameras: ``(N,)`` cameras of the walk.
+        cameras: ``(N,)`` cameras of the walk, or None.
         num_frames: pictures of a turn.
 
     Returns:
@@ -93,13 +100,16 @@ def turntable_frames(
     objects: ObjectSet,
     meshes: Sequence[trimesh.Trimesh | None],
     *,
-    cameras: Cameras,
+    cameras: Cameras | None,
     num_frames: int,
 ) -> Iterator[Image.Image]:
     """Yield the pictures of a turn; arguments as of ``draw_turntable``."""
     corners = box_corners(objects).reshape(-1, 3).double().cpu()
-    walk = cameras.position.double().cpu()
-    points = torch.cat([corners, walk])
+    walk = torch.zeros(0, 3).double() if cameras is None else cameras.position.double().cpu()
+    # The objects fill the picture; the path may leave it.
+    points = corners if len(corners) else walk
+    if not len(points):
+        points = torch.zeros(1, 3).double()
     low, high = points.amin(dim=0), points.amax(dim=0)
     floor = float(corners[:, 2].min()) if len(corners) else float(low[2])
     lines = _lines(objects, walk, low, high, floor)
@@ -116,23 +126,47 @@ def turntable_frames(
         picture = Image.fromarray(_solid(ids[n], depths[n], rays, colors))
         large = picture.resize((SIZE[1] * _FINER, SIZE[0] * _FINER), Image.Resampling.BICUBIC)
         _draw_lines(large, lines, camera, depths[n])
-        yield large.resize(picture.size, Image.Resampling.BOX)
+        small = large.resize(picture.size, Image.Resampling.BOX)
+        _write_legend(small, objects)
+        yield small
+
+
+def _write_legend(picture: Image.Image, objects: ObjectSet) -> None:
+    """Write how many objects of which class there are, in the colours of the classes, at the lower edge."""
+    pen, letters = ImageDraw.Draw(picture), font(_LETTERS)
+    entries = [
+        (f"{count} {objects.classes.names[label]}", objects.classes.colors[label])
+        for label, count in sorted(Counter(objects.label.tolist()).items())
+    ]
+    x, y = _LETTERS, picture.height - 2 * _LETTERS
+    for text, color in reversed(entries):
+        width = round(pen.textlength(text, font=letters)) + 2 * _LETTERS
+        if x + width > picture.width:
+            x, y = _LETTERS, y - round(1.5 * _LETTERS)
+        pen.rectangle([x, y + 2, x + _LETTERS - 4, y + _LETTERS - 2], fill=color)
+        pen.text((x + _LETTERS, y - 2), text, font=letters, fill=INK)
+        x += width + _LETTERS
 
 
 def _orbit(points: Tensor, num_frames: int) -> Cameras:
-    """Return ``(num_frames,)`` cameras around points ``(n, 3)``, so far away that all see all of them."""
+    """Return ``(num_frames,)`` cameras around points ``(n, 3)``, which fill the picture in one turn."""
     height, width = SIZE
-    focal = height / 2 / math.tan(_FIELD_OF_VIEW / 2)
     headings = math.pi / 2 - 2 * math.pi * np.arange(num_frames) / num_frames
     pose = torch.from_numpy(
         np.stack([pose_from_heading(np.zeros(3), heading, _DOWN, 0.0) for heading in headings])
     )
     center = (points.amin(dim=0) + points.amax(dim=0)) / 2
-    right, below, ahead = ((points - center) @ pose[:, :3, :3]).unbind(-1)
-    reach = torch.maximum(right.abs() * (focal / (width / 2)), below.abs() * (focal / (height / 2)))
-    distance = max(float((reach / _FILLED - ahead).max()), _NEAREST)
-    pose[:, :3, 3] = center - distance * pose[:, :3, 2]
-    intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]]).double()
+    radius = max(float((points - center).norm(dim=1).max()), _SMALLEST)
+    pose[:, :3, 3] = center - _DISTANCE * radius * pose[:, :3, 2]
+    right, below, ahead = ((points - pose[:, None, :3, 3]) @ pose[:, :3, :3]).unbind(-1)
+    across, (top, bottom) = float((right / ahead).abs().max()), (below / ahead).aminmax()
+    # Room for the legend below.
+    free = height - 3 * _LETTERS
+    focal = min(
+        _FILLED * width / max(2 * across, 1e-3), _FILLED * free / max(float(bottom - top), 1e-3), 4.0 * width
+    )
+    row = free / 2 - focal * float(top + bottom) / 2
+    intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, row], [0, 0, 1]]).double()
     return Cameras(intrinsics.expand(num_frames, 3, 3), pose, SIZE)
 
 

@@ -11,7 +11,7 @@ import io
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -160,7 +160,6 @@ def predicted_volumes(
     prediction: ScenePrediction,
     observed: ObservedAttention | None,
     *,
-    grid_extent: tuple[float, float, float],
     parts: Sequence[tuple[Tensor, Sequence[int]]] = (),
 ) -> list[VoxelVolume]:
     """Return the voxels of a prediction, and from which pixels the last block gathered what they hold.
@@ -170,23 +169,27 @@ def predicted_volumes(
         views: B = 1, all frames.
         prediction: its result, on the CPU.
         observed: what was recorded while it ran (``observe_attention``), or None.
-        grid_extent: sizes of the prediction's voxel grid, metres.
         parts: centre ``(3,)`` and frames of each run of the network, if it was not one on all frames.
 
     Returns:
         the prediction's grid, and if there are several parts each of these with what it read; none if the
         prediction has no voxels.
     """
-    if prediction.occupancy is None:
+    whole = whole_volume(prediction, views)
+    if not whole or observed is None:
+        return whole
+    runs = parts or [(prediction.grid_center, whole[0].frames)]
+    read = _read_volumes(model, views, observed, runs)
+    return [replace(whole[0], reads=read[0].reads)] if len(read) == 1 else [*whole, *read]
+
+
+def whole_volume(prediction: ScenePrediction, views: Views) -> list[VoxelVolume]:
+    """Return the one volume of a prediction, of which is not known what it read; none if it has no voxels."""
+    if prediction.occupancy is None or prediction.grid_extent is None:
         return []
     x, y, z = prediction.occupancy.shape
-    everything = range(views.images.shape[1])
-    grid = VoxelGrid((x, y, z), grid_extent, prediction.grid_center)
-    runs = parts or [(prediction.grid_center, everything)]
-    read = [] if observed is None else _read_volumes(model, views, observed, runs)
-    whole = read[0].reads if len(read) == 1 else None
-    volume = VoxelVolume(grid, everything, prediction.occupancy, prediction.seen, whole)
-    return [volume] if len(read) <= 1 else [volume, *read]
+    grid = VoxelGrid((x, y, z), prediction.grid_extent, prediction.grid_center)
+    return [VoxelVolume(grid, range(views.images.shape[1]), prediction.occupancy, prediction.seen)]
 
 
 def _read_volumes(

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 
+import rich
 import viser
 
 from raytran.errors import ConfigError
@@ -32,17 +33,29 @@ def quiet_server(host: str = "127.0.0.1", port: int = 0) -> Iterator[viser.Viser
     """
     logging.getLogger("websockets.server").setLevel(logging.WARNING)
     before = set(threading.enumerate())
-    with redirect_stdout(io.StringIO()):
+    with _silence():
         server = viser.ViserServer(host=host, port=port, label="raytran", verbose=False)
     loop = [thread for thread in threading.enumerate() if thread.daemon and thread not in before]
     try:
         yield server
     finally:
-        with redirect_stdout(io.StringIO()):
+        with _silence():
             server.stop()
             # viser waits a while for its thread, which on a busy machine says good-bye later.
             for thread in loop:
                 thread.join(timeout=30)
+
+
+@contextmanager
+def _silence() -> Iterator[None]:
+    """Have viser print nothing; in a notebook rich does not write to the standard output."""
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        with redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        console.quiet = before
 
 
 def free_port(host: str, port: int | None) -> int:

@@ -79,12 +79,17 @@ def scene(split: str, scene_id: str, output) -> ShownScene:
         foreground=torch.zeros(1, 3, 48, 64, dtype=torch.bool),
     )
     prediction = ScenePrediction(
-        scene_id, objects, torch.zeros(3), occupancy=torch.rand(4, 4, 4), foreground=torch.rand(3, 48, 64)
+        scene_id,
+        objects,
+        torch.zeros(3),
+        occupancy=torch.rand(4, 4, 4),
+        foreground=torch.rand(3, 48, 64),
+        grid_extent=(6.0, 6.0, 3.0),
     )
     folder = output / "predictions" / scene_id
     extent = (6.0, 6.0, 3.0)
     found = PredictedScene(prediction, [None])
-    write_scene(folder, found, views, batch.frame_id[0], grid_extent=extent, turntable=0, truth=objects)
+    write_scene(folder, found, views, batch.frame_id[0], turntable=0, truth=objects)
     return ShownScene(split, folder, batch, prediction, extent)
 
 

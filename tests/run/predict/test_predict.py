@@ -74,7 +74,9 @@ class Oracle(nn.Module):
         chosen = objects.select(objects.score >= score_threshold)
         counts = torch.full((4, 4, 2), views.images.shape[1], dtype=torch.int32)
         occupancy = torch.rand(4, 4, 2)
-        return ScenePrediction(scene_id, chosen, torch.zeros(3), occupancy=occupancy, seen=counts)
+        return ScenePrediction(
+            scene_id, chosen, torch.zeros(3), occupancy=occupancy, seen=counts, grid_extent=self.grid_extent
+        )
 
 
 @pytest.fixture

@@ -63,7 +63,9 @@ class Knowing(nn.Module):
         inside = VoxelGrid(RESOLUTION, EXTENT, center).voxel_centers()
         seen = torch.full(RESOLUTION, views.images.shape[1], dtype=torch.int32)
         # What a voxel holds here is where it is.
-        return ScenePrediction(scene_id, objects, center, occupancy=inside[..., 0], seen=seen)
+        return ScenePrediction(
+            scene_id, objects, center, occupancy=inside[..., 0], seen=seen, grid_extent=EXTENT
+        )
 
 
 def furniture(length: float, generator: torch.Generator) -> ObjectSet:

@@ -19,14 +19,14 @@ from PIL import ImageDraw
 from raytran.classes import PAPER_CLASSES, Classes
 from raytran.data.files import disk_full
 from raytran.data.shapenet.voxelize import voxelize_solid
-from raytran.errors import DataError
+from raytran.errors import ConfigError, DataError, ShapeError
 from raytran.export.read import read_alignments_csv, read_predictions
 from raytran.geometry.rotation import rotation_from_yaw
-from raytran.postprocess import object_meshes
 from raytran.rooms.cad import CadModel, sample_model
 from raytran.rooms.shapenet_files import write_model
 from raytran.run.predict.write_scene import PredictedScene, write_scene
 from raytran.structs import ObjectSet, ScenePrediction, Views
+from raytran.viewer import has_viser
 from raytran.viewer.data import read_viewer_scene
 
 from ...factories import digests
@@ -52,8 +52,10 @@ def found(chair) -> PredictedScene:
         score=torch.tensor([0.9, 0.6]),
         shape=torch.stack([shape, torch.zeros_like(shape)]),
     )
-    prediction = ScenePrediction("room", objects, torch.zeros(3), occupancy=torch.full((4, 4, 2), 0.7))
-    return PredictedScene(prediction, object_meshes(prediction))
+    prediction = ScenePrediction(
+        "room", objects, torch.zeros(3), occupancy=torch.full((4, 4, 2), 0.7), grid_extent=(4.0, 4.0, 2.0)
+    )
+    return PredictedScene.of(prediction)
 
 
 @pytest.fixture
@@ -71,7 +73,6 @@ def write(output: Path, found: PredictedScene, views: Views, turntable: int = 0)
         found,
         views,
         ["0", "5"],
-        grid_extent=(4.0, 4.0, 2.0),
         num_overlays=0,
         turntable=turntable,
     )
@@ -125,9 +126,9 @@ def test_every_file_has_the_names_and_colours_of_own_classes(tmp_path, found, vi
         PredictedScene(prediction, found.meshes, volumes=[]),
         views,
         ["0", "5"],
-        grid_extent=(4.0, 4.0, 2.0),
         num_overlays=1,
         turntable=1,
+        obj=True,
         truth=truth,
     )
     # Over a frame, in the plan, and in its legend.
@@ -168,3 +169,42 @@ def test_cad_models_are_named_placed_and_drawn(tmp_path, found, views, chair, ca
     # `evaluate predictions=` reads the folder as one scene, once.
     read = read_predictions(output, ["room"], {})
     assert (list(read.scenes), read.ignored) == (["room"], ())
+
+
+def test_a_prediction_saves_itself_as_the_command_does(tmp_path, found, views):
+    prediction = found.prediction
+    assert prediction.save(tmp_path / "bare") == tmp_path / "bare"
+    names = {path.name for path in (tmp_path / "bare").iterdir()}
+    assert names == FILES - {"overlays"} | {"turntable.gif"}
+    seen = replace(prediction, scene_id="").save(
+        str(tmp_path / "seen"), views, frame_ids=["a", "b"], obj=True
+    )
+    names = {path.name for path in seen.iterdir()}
+    html = {"prediction.html"} if has_viser() else set()
+    assert names == FILES | {"turntable.gif", "viewer.npz"} | html
+    assert {path.name for path in (seen / "overlays").iterdir()} == {"a.jpg", "b.jpg"}
+    assert (seen / "meshes/00.obj").is_file()
+    shown = read_viewer_scene(seen)
+    assert (shown.scene_id, shown.frame_ids) == ("seen", ["a", "b"])
+    assert shown.occupancy.shape == (4, 4, 2)
+    with pytest.raises(ShapeError, match="got 1 for 2 views"):
+        prediction.save(tmp_path / "none", views, frame_ids=["a"])
+    assert not (tmp_path / "none").exists()
+    whole = trimesh.load_mesh(prediction.save(tmp_path / "whole", mesh_error=0) / "meshes/00.ply")
+    assert len(whole.faces) > 2 * len(trimesh.load_mesh(tmp_path / "bare/meshes/00.ply").faces)
+
+
+def test_a_prediction_shows_itself(found, views, monkeypatch):
+    shown = []
+    monkeypatch.setattr(
+        "raytran.viewer.show", lambda folder, height: shown.append((read_viewer_scene(folder), height))
+    )
+    monkeypatch.setattr("raytran.run.predict.write_scene.has_viser", lambda: True)
+    found.prediction.show()
+    found.prediction.show(views, height=200)
+    (bare, _), (seen, height) = shown
+    assert [mesh is not None for mesh in bare.meshes] == [True, False]
+    assert (len(bare.images), len(seen.images), height) == (0, 2, 200)
+    monkeypatch.setattr("raytran.run.predict.write_scene.has_viser", lambda: False)
+    with pytest.raises(ConfigError, match=r"raytran\[viewer\]"):
+        found.prediction.show()

@@ -210,7 +210,7 @@ def _predict_first(cfg: DictConfig, name: str, asked: Evaluated, output: Path) -
     folder = output / "predictions" / (("shipped-" if name == "shipped" else "") + batch.scene_id[0])
     truth = None if batch.objects is None else batch.objects[0]
     extent = asked.model.grid_extent
-    write_scene(folder, scene, batch.views, batch.frame_id[0], grid_extent=extent, truth=truth)
+    write_scene(folder, scene, batch.views, batch.frame_id[0], truth=truth)
     return ShownScene(name, folder, batch, scene.prediction, extent)
 
 

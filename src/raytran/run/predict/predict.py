@@ -21,8 +21,9 @@ from raytran.checkpoints.load import PredictionSettings, load_model, prediction_
 from raytran.checkpoints.network import trusted_packages
 from raytran.data.shapenet.models import shapenet_version
 from raytran.errors import ConfigError
+from raytran.export.simplify import MESH_ERROR
 from raytran.model import RayTran
-from raytran.postprocess import count_object_views, merge_volumes, object_meshes, select_objects
+from raytran.postprocess import count_object_views, merge_volumes, select_objects
 from raytran.run.device import choose_device, device_name, set_matmul_precision
 from raytran.run.output import one_writer
 from raytran.run.predict.new_views import cameras_to_render, render_views
@@ -116,6 +117,7 @@ def _predict(
         views_at_once=cfg.views_at_once,
         with_shapes=settings.stage not in _WITHOUT_SHAPES,
         for_viewer=cfg.viewer,
+        mesh_error=cfg.mesh_error,
     )
     if cfg.cads:
         scene = scene.with_cads(Path(cfg.cads))
@@ -125,9 +127,9 @@ def _predict(
         scene,
         room.views,
         room.frame_ids,
-        grid_extent=room.volumes.joint().extent,
         num_overlays=cfg.num_overlays,
         turntable=cfg.turntable,
+        obj=cfg.obj,
         truth=truth,
     )
     if new_cameras is not None:
@@ -159,6 +161,7 @@ def predict_scene(
     views_at_once: int | None = None,
     with_shapes: bool = True,
     for_viewer: bool = True,
+    mesh_error: float = MESH_ERROR,
 ) -> PredictedScene:
     """Predict a room, and make of it what ``write_scene`` writes.
 
@@ -171,6 +174,7 @@ def predict_scene(
         views_at_once: frames that pass through the network together, None for all; fewer need less memory.
         with_shapes: decode the objects' shapes.
         for_viewer: keep for the viewer how the network read the frames.
+        mesh_error: farthest that a mesh may lie from the surface of its shape, metres; 0: every triangle.
 
     Returns:
         The result, on the CPU.
@@ -189,9 +193,8 @@ def predict_scene(
     if for_viewer:
         several = len(room.volumes) > 1
         parts = tuple(zip(room.volumes.center, room.members, strict=True)) if several else ()
-        extent = room.volumes.joint().extent
-        volumes = predicted_volumes(model, room.views, prediction, observed, grid_extent=extent, parts=parts)
-    return PredictedScene(prediction, object_meshes(prediction), volumes=volumes)
+        volumes = predicted_volumes(model, room.views, prediction, observed, parts=parts)
+    return PredictedScene.of(prediction, mesh_error=mesh_error, volumes=volumes)
 
 
 def predict_room(
@@ -227,7 +230,7 @@ def predict_room(
             grid_center=grid_center,
         ).to("cpu")
         prediction = select_objects(prediction, score_threshold=score_threshold, duplicate_iou=duplicate_iou)
-        objects = count_object_views(prediction, grid_extent=model.grid_extent)
+        objects = count_object_views(prediction)
         predictions.append(replace(prediction, objects=objects))
     return predictions[0] if len(predictions) == 1 else merge_volumes(predictions, room.volumes)
 
