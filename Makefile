@@ -17,7 +17,8 @@ $(VENV)/.installed: pyproject.toml requirements/ci.txt
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \
 		{ echo "raytran needs Python 3.11 to 3.13; name one with: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --requirement requirements/ci.txt
+	$(BIN)/pip install --quiet --no-compile --requirement requirements/ci.txt
+	@$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib src || true  # on all cores; some packages bring templates
 	$(BIN)/pip install --quiet --no-deps --editable .
 	@touch $@
 

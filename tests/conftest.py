@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import logging
 import math
@@ -38,6 +39,12 @@ from .factories import Trained
 from .scan_forms import INTRINSICS, encode_color, encode_sens, look_along_x, write_form
 
 PROJECT_ROOT = Path(__file__).resolve().parents[1]
+
+
+def pytest_collection_finish() -> None:
+    """Let the garbage collector leave out the million objects of torch, Lightning and pytest from now on."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

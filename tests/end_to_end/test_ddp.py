@@ -30,7 +30,7 @@ def curriculum(steps, tmp_path_factory, command):
     """The folder of a curriculum on two ranks of one scene."""
     folder = tmp_path_factory.mktemp("two")
     arguments = [*steps, "trainer=ddp_cpu", "views.batch_size=1", f"output_dir={folder}"]
-    done = command("curriculum", *arguments, folder=folder)
+    done = command("curriculum", *arguments, folder=folder, starts=len(STAGES))
     # Ranks that differ in a bit, at the start or the end of a stage or at a validation, stop the command.
     assert done.returncode == 0, done.stderr
     return folder
@@ -71,7 +71,7 @@ def test_two_ranks_share_one_folder_a_stage(curriculum):
 def test_ranks_share_the_batch_norms_of_voxels_too(steps, tmp_path, command):
     """The ranks' networks are compared at every validation; one that differs stops the command."""
     arguments = [*steps, "trainer=ddp_cpu", "variant=unprojection", "output_dir=run"]
-    done = command("train", *arguments, folder=tmp_path)
+    done = command("train", *arguments, folder=tmp_path, starts=1)
     assert done.returncode == 0, done.stderr
     state = torch.load(tmp_path / "run" / LAST, weights_only=True)["state_dict"]
     assert int(state["model.backbone.voxel_network.down.0.0.bn1.num_batches_tracked"]) == STEPS
@@ -85,13 +85,13 @@ NORMS_OF_THEIR_OWN = ("trainer=ddp_cpu", "experiment=stage1", "views.batch_size=
 def test_ranks_take_two_passes_a_step(steps, tmp_path, command):
     """Then the strategy may not take the graph for a static one."""
     twice = ["trainer.accumulate_grad_batches=2", "trainer.max_steps=3", "output_dir=twice"]
-    done = command("train", *steps, *NORMS_OF_THEIR_OWN, *twice, folder=tmp_path)
+    done = command("train", *steps, *NORMS_OF_THEIR_OWN, *twice, folder=tmp_path, starts=1)
     assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.slow
 def test_ranks_with_batch_norms_of_their_own_train_one_network(curriculum, steps, tmp_path, command):
-    done = command("train", *steps, *NORMS_OF_THEIR_OWN, "output_dir=run", folder=tmp_path)
+    done = command("train", *steps, *NORMS_OF_THEIR_OWN, "output_dir=run", folder=tmp_path, starts=1)
     assert done.returncode == 0, done.stderr
     own, shared = (
         torch.load(folder / LAST, weights_only=True)["state_dict"]

@@ -140,7 +140,7 @@ def test_commands_that_start_others_hand_the_configs_on(words, run, settings, la
     common = [item for item in settings if item != "trainer=cpu"]
     flags = [word for word in more if word.startswith("--")]
     typed = ["model/backbone=mine", *common, f"outputs={name}", *(word for word in more if word not in flags)]
-    done = run(name, *flags, "--config-dir", "conf", *typed)
+    done = run(name, *flags, "--config-dir", "conf", *typed, starts=1)
     assert done.returncode == 0, done.stdout + done.stderr
     (path,) = (lab / name).glob("**/last.ckpt")
     assert torch.load(path, weights_only=True)["model"]["backbone"]["_target_"] == "mylab.MyBackbone"

@@ -21,7 +21,7 @@ def swept(settings, command, tmp_path_factory):
     shared = [item for item in settings if not item.startswith("trainer=")]
     words = ["-m", "trainer=ddp_cpu", "trainer.devices=1,0,2", "trainer.max_steps=2", *shared]
     words = [item for item in words if item != "trainer.max_steps=4"]
-    done = command("train", *words, folder=folder)
+    done = command("train", *words, folder=folder, starts=3)
     (sweep,) = (folder / "outputs" / "sweeps").iterdir()
     return words, done, sweep
 
@@ -54,7 +54,7 @@ def test_a_job_on_two_devices_trains_on_two_processes(swept):
 def test_a_second_call_runs_only_what_failed(swept, command):
     words, _, sweep = swept
     before = {number: (sweep / number / "finished.json").read_bytes() for number in "02"}
-    again = command("train", *words, folder=sweep.parents[2])
+    again = command("train", *words, folder=sweep.parents[2], starts=1)
     assert again.returncode == 1
     assert [path for path in sweep.parent.iterdir()] == [sweep], "one folder for both calls"
     assert {number: (sweep / number / "finished.json").read_bytes() for number in "02"} == before

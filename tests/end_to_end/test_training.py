@@ -8,8 +8,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 
 import pytest
@@ -288,23 +286,16 @@ def test_evaluate_writes_numbers(trained, rooms, tmp_path, command):
 )
 def test_a_stopped_run_goes_on(stop, code, settings, tmp_path, command):
     long = [*settings, "trainer.max_steps=400", "checkpoint_every=100000", "trainer.val_check_interval=1000"]
-    with subprocess.Popen(
-        [sys.executable, "-m", "raytran.train", *long],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},
-    ) as process:
-        deadline = time.monotonic() + 120
-        while (
-            sum(path.read_text().count("\n") for path in tmp_path.glob("outputs/tiny/stage1/*/metrics.csv"))
-            < 4
-        ):
-            assert process.poll() is None
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-        process.send_signal(stop)
-        assert process.wait(timeout=60) == code
+    process = command.start("train", *long, folder=tmp_path)
+    deadline = time.monotonic() + 120
+    while (
+        sum(path.read_text().count("\n") for path in tmp_path.glob("outputs/tiny/stage1/*/metrics.csv")) < 4
+    ):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    os.kill(process.pid, stop)
+    done = process.wait()
+    assert done.returncode == code, done.stderr
     (run,) = tmp_path.glob("outputs/tiny/stage1/*")
     step = torch.load(run / LAST, weights_only=True)["global_step"]
     assert 0 < step < 400
@@ -328,7 +319,7 @@ def test_two_processes_train_together(settings, trained, tmp_path, command):
         "resume=auto",
     ]
     for steps in (2, 4):
-        done = command("train", *arguments, f"trainer.max_steps={steps}", folder=tmp_path)
+        done = command("train", *arguments, f"trainer.max_steps={steps}", folder=tmp_path, starts=1)
         assert done.returncode == 0, done.stderr
         assert read_finished(run).steps == steps
         # Two scenes on each of two ranks a step.

@@ -5,9 +5,7 @@ from __future__ import annotations
 
 import copy
 import json
-import os
 import pickle
-import subprocess
 import sys
 import warnings
 from dataclasses import replace
@@ -141,13 +139,12 @@ def results(indices: tuple[int, ...], dtype: torch.dtype = torch.float32) -> dic
 
 
 @pytest.fixture(scope="module")
-def found_by_ranks(tmp_path_factory) -> list[dict]:
+def found_by_ranks(tmp_path_factory, command) -> list[dict]:
     """What each of two processes finds, for all shares of the scenes in turn."""
     folder = tmp_path_factory.mktemp("ranks")
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, __file__, str(folder)]
-    ranks = [subprocess.Popen([*command, rank], env=environment) for rank in "01"]
-    assert [rank.wait(timeout=240) for rank in ranks] == [0, 0]
+    for rank in [command.start(__file__, folder, rank, folder=folder) for rank in "01"]:
+        done = rank.wait()
+        assert done.returncode == 0, done.stderr
     return [json.loads((folder / f"{rank}.json").read_text()) for rank in "01"]
 
 

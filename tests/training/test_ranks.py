@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import socket
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -71,26 +70,17 @@ def in_float64(value):
 
 
 @pytest.fixture
-def two_ranks(scenes, tmp_path):
+def two_ranks(scenes, tmp_path, command):
     """What two ranks say, one scene each."""
     torch.save(scenes, tmp_path / "scenes.pt")
-    environment = os.environ | {
-        "OMP_NUM_THREADS": "1",
-        "MASTER_ADDR": "127.0.0.1",
-        "MASTER_PORT": free_port(),
-    }
+    meeting = {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": free_port(), "WORLD_SIZE": "2", "NODE_RANK": "0"}
     ranks = [
-        subprocess.Popen(
-            [sys.executable, __file__, str(tmp_path)],
-            env=environment | {"WORLD_SIZE": "2", "LOCAL_RANK": rank, "NODE_RANK": "0", "RANK": rank},
-            stderr=subprocess.PIPE,
-            text=True,
-        )
+        command.start(__file__, tmp_path, folder=tmp_path, **meeting, LOCAL_RANK=rank, RANK=rank)
         for rank in "01"
     ]
     for rank in ranks:
-        _, stderr = rank.communicate(timeout=300)
-        assert rank.returncode == 0, stderr
+        done = rank.wait()
+        assert done.returncode == 0, done.stderr
     return [torch.load(tmp_path / f"{rank}.pt", weights_only=True) for rank in "01"]
 
 

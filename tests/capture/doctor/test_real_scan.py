@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
 
 import numpy as np
 import pytest
+from skimage.feature import ORB
 
+from raytran.capture.doctor import matches
 from raytran.capture.doctor.examine import examine
 from raytran.data.scan2cad import read_annotations
 from raytran.data.scannet.find import find_scans
@@ -19,6 +22,24 @@ from ..forms import OPENGL
 SCAN = "scene0470_00"
 
 pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module", autouse=True)
+def features_once():
+    """What is spoiled is never an image: all copies have the same features, which take the longest to find."""
+    known = {}
+
+    class Known(ORB):
+        def detect_and_extract(self, image):
+            key = hashlib.sha256(image.tobytes()).digest()
+            if key not in known:
+                super().detect_and_extract(image)
+                known[key] = self.keypoints, self.descriptors
+            self.keypoints, self.descriptors = known[key]
+
+    with pytest.MonkeyPatch.context() as context:
+        context.setattr(matches, "ORB", Known)
+        yield
 
 
 @pytest.fixture

@@ -22,6 +22,12 @@ DIRECTIONS = ("pixels_to_voxels", "voxels_to_pixels")
 both_directions = pytest.mark.parametrize("direction", DIRECTIONS)
 
 
+@pytest.fixture(autouse=True)
+def few_slots(monkeypatch):
+    """The interpreter takes its time over every program, also of a slot that is not used."""
+    monkeypatch.setattr(block_pairs, "_SLOTS", 16)
+
+
 def _inputs(
     pairs: PairList, direction: str, heads: int, dim: int, generator, dtype=torch.float32
 ) -> list[Tensor]:

@@ -2,8 +2,6 @@
 from __future__ import annotations
 
 import logging
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +16,8 @@ from raytran.run.plan.dry_run import Load, dry_training
 from raytran.run.plan.plan import GIBIBYTE, Need, advice, parse_size, plan
 from raytran.run.plan.roofline import Ceilings, measure_ceilings
 from raytran.run.train.build import build_model
+
+from ...commands import Commands
 
 FAST = ["preset=tiny", "ceilings=[1,10]", "model.backbone.num_blocks=1", "model.heads.objects.num_layers=1"]
 
@@ -142,8 +142,11 @@ print((status("VmHWM") - before + weights) / (SCRATCH * forecast + FIXED))
 
 
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="needs Linux's peak of memory")
-def test_the_forecast_is_within_a_factor_of_two_of_the_measured_peak() -> None:
-    done = subprocess.run([sys.executable, "-c", MEASURED], capture_output=True, text=True, check=False)
+def test_the_forecast_is_within_a_factor_of_two_of_the_measured_peak(
+    command: Commands, tmp_path: Path
+) -> None:
+    (tmp_path / "measured.py").write_text(MEASURED)
+    done = command(str(tmp_path / "measured.py"), folder=tmp_path)
     assert done.returncode == 0, done.stderr
     assert 0.5 < float(done.stdout.split()[-1]) < 2.0
 

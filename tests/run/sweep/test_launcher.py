@@ -54,15 +54,18 @@ main()
 
 
 @pytest.fixture
-def sweep(tmp_path):
+def sweep(tmp_path, command):
     """Run ``python -m raytran.train -m …`` in a folder of its own, with a script in place of each job."""
     (tmp_path / "job.py").write_text(JOB)
     (tmp_path / "command.py").write_text(COMMAND)
 
-    def start(*words, **environment):
+    def typed(words):
         many = [] if any(word.startswith("sweep=") for word in words) else ["-m"]
+        return [*many, "preset=tiny", "trainer=cpu", *words]
+
+    def start(*words, **environment):
         return subprocess.Popen(
-            [sys.executable, "command.py", *many, "preset=tiny", "trainer=cpu", *words],
+            [sys.executable, "command.py", *typed(words)],
             cwd=tmp_path,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
@@ -71,9 +74,8 @@ def sweep(tmp_path):
         )
 
     def run(*words, **environment):
-        process = start(*words, **environment)
-        said, _ = process.communicate()
-        return process.returncode, said
+        done = command(str(tmp_path / "command.py"), *typed(words), folder=tmp_path, **environment)
+        return done.returncode, done.stdout + done.stderr
 
     run.start, run.folder = start, tmp_path
     return run
