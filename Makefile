@@ -23,7 +23,7 @@ $(VENV)/.installed: pyproject.toml requirements/ci.txt
 	@touch $@
 
 demo: install  ## Make rooms, train the three stages, evaluate, predict, and write one page to look at (CPU, minutes)
-	$(BIN)/python -m raytran.demo
+	$(BIN)/raytran demo
 
 test: install  ## Run all tests but those of the night
 	OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal -m 'not nightly'

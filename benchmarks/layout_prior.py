@@ -3,7 +3,7 @@
 
 Every scene of the split gets the same furniture around its cameras: the classes, places and directions that
 the training rooms hold most often, each with the median height and size of its class there. The files go to
-``python -m raytran.evaluate predictions=DIR``.
+``raytran evaluate predictions=DIR``.
 """
 
 from __future__ import annotations

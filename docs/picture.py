@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One picture of what ``python -m raytran.predict`` wrote: ``python docs/picture.py PREDICTION PICTURE.jpg``.
+"""One picture of what ``raytran predict`` wrote: ``python docs/picture.py PREDICTION PICTURE.jpg``.
 
 Frames with boxes and meshes on the left, the plan on the right; small enough for a README.
 """

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands of raytran in processes of their own that need not import torch and Lightning first.
 
-``python -m raytran.train`` takes six seconds of a core before it does anything. ``Commands`` imports all that
+``raytran train`` takes six seconds of a core before it does anything. ``Commands`` imports all that
 once, in a process that does nothing else (``command_server.py``), and forks it for every command.
 """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Train the three stages one after another: ``python -m raytran.curriculum preset=raytran|small|…``."""
+"""Train the three stages one after another: ``raytran curriculum preset=raytran|small|…``."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole path on generated rooms, without a download, on a CPU: ``python -m raytran.demo``."""
+"""The whole path on generated rooms, without a download, on a CPU: ``raytran demo``."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evaluate a checkpoint: ``python -m raytran.evaluate checkpoint=CKPT``."""
+"""Evaluate a checkpoint: ``raytran evaluate checkpoint=CKPT``."""
 
 from __future__ import annotations
 

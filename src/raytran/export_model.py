@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Export a network: ``python -m raytran.export_model checkpoint=CKPT output=FILE.safetensors``."""
+"""Export a network: ``raytran export_model checkpoint=CKPT output=FILE.safetensors``."""
 
 from __future__ import annotations
 

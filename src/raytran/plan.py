@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plan memory and time: ``python -m raytran.plan data.views=96 gpu=16GB``."""
+"""Plan memory and time: ``raytran plan data.views=96 gpu=16GB``."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Predict the objects of a scene: ``python -m raytran.predict checkpoint=CKPT scene=FOLDER output=DIR``."""
+"""Predict the objects of a scene: ``raytran predict checkpoint=CKPT scene=FOLDER output=DIR``."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write a data set: ``python -m raytran.prepare dataset=rooms output=DIR``."""
+"""Write a data set: ``raytran prepare dataset=rooms output=DIR``."""
 
 from __future__ import annotations
 

@@ -518,7 +518,7 @@ class ScenePrediction(TensorStruct):
         mesh_error: float = 0.01,
         obj: bool = False,
     ) -> Path:
-        """Write the files of ``python -m raytran.predict`` (docs/outputs.md), all or nothing.
+        """Write the files of ``raytran predict`` (docs/outputs.md), all or nothing.
 
         Args:
             folder: replaced if it is an earlier result.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Train one stage: ``python -m raytran.train experiment=stage1|stage2|stage3 preset=raytran|small|…``."""
+"""Train one stage: ``raytran train experiment=stage1|stage2|stage3 preset=raytran|small|…``."""
 
 from __future__ import annotations
 

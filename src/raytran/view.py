@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Look at predicted scenes in a browser: ``python -m raytran.view FOLDER``."""
+"""Look at predicted scenes in a browser: ``raytran view FOLDER``."""
 
 from __future__ import annotations
 

@@ -124,10 +124,10 @@ def test_every_command_has_its_page(project_root):
 @pytest.mark.parametrize(
     ("text", "found"),
     [
-        ("`python -m raytran.train seed=1`, and", [("train", ("seed=1",))]),
+        ("`raytran train seed=1`, and", [("train", ("seed=1",))]),
         ("raytran train seed=1    all else; raytran carries", [("train", ("seed=1",))]),
         ("raytran predict walk.mp4 of raytran's", [("predict", ())]),
-        ("python -m raytran.view PREDICTION   # in the browser", [("view", ("PREDICTION",))]),
+        ("raytran view PREDICTION   # in the browser", [("view", ("PREDICTION",))]),
         (
             "-m raytran.evaluate a=x|y \\\n  [b=c]",
             [("evaluate", ("a=x", "b=c")), ("evaluate", ("a=y", "b=c"))],

@@ -21,7 +21,7 @@ from raytran.rooms.generate import generate_rooms
 from ..test_layers import violations
 
 FILE = re.compile(r"^```(?:python|yaml)\n# lab/(\S+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-TYPED = re.compile(r"^python -m raytran\.(\w+) --config-dir lab/conf (.*?)(?:\s+#.*)?$", re.MULTILINE)
+TYPED = re.compile(r"^raytran (\w+) --config-dir lab/conf (.*?)(?:\s+#.*)?$", re.MULTILINE)
 SETTINGS = (
     "preset=tiny",
     "trainer=cpu",

@@ -64,7 +64,7 @@ def test_a_stage_does_not_start_from_a_parent_on_other_data(
     done = command("train", *asked, f"output_dir={tmp_path / 'run'}", folder=tmp_path)
     assert done.returncode == 1
     (said,) = done.stderr.splitlines()
-    assert "is on these data, 1 on others: run `python -m raytran.train experiment=stage1 preset=tiny" in said
+    assert "is on these data, 1 on others: run `raytran train experiment=stage1 preset=tiny" in said
     assert f"there is {parent.checkpoint} on rooms in" in done.stdout
     assert not (tmp_path / "run" / "checkpoints").exists()
 

@@ -221,7 +221,7 @@ def test_a_run_is_not_continued_as_another_stage(settings, trained, tmp_path):
 
 def test_init_from_auto_takes_the_newest_parent(settings, trained, tmp_path):
     outputs = tmp_path / "outputs"
-    with pytest.raises(ConfigError, match=r"`python -m raytran\.train experiment=stage1 preset=tiny` first"):
+    with pytest.raises(ConfigError, match=r"`raytran train experiment=stage1 preset=tiny` first"):
         fit(settings, outputs / "tiny" / "stage2" / "a", "experiment=stage2", f"outputs={outputs}")
     parent = fit(settings, outputs / "tiny" / "stage1" / "a", f"outputs={outputs}")
     child = fit(settings, outputs / "tiny" / "stage2" / "b", "experiment=stage2", f"outputs={outputs}")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m raytran.prepare dataset=rooms-v1`` at its end: what the rooms are like."""
+"""``raytran prepare dataset=rooms-v1`` at its end: what the rooms are like."""
 
 from __future__ import annotations
 

@@ -220,7 +220,7 @@ def test_one_result_or_many(tmp_path):
 
 
 def test_nothing_to_show(tmp_path):
-    with pytest.raises(DataError, match=r"nowhere: give the output folder of `python -m raytran\.predict`"):
+    with pytest.raises(DataError, match=r"nowhere: give the output folder of `raytran predict`"):
         find_scenes(tmp_path / "nowhere")
     with pytest.raises(DataError, match=r"holds no scene\.json"):
         find_scenes(tmp_path)

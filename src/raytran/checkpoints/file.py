@@ -344,7 +344,7 @@ def read_weights(path: Path) -> dict[str, Any]:
     if metadata is None:
         raise CheckpointError(
             f"{path} holds no network of raytran: its header does not say how to build one; "
-            "give a file that `python -m raytran.export_model` wrote"
+            "give a file that `raytran export_model` wrote"
         )
     content = {**metadata, "state_dict": {f"{PREFIX}{name}": value for name, value in weights.items()}}
     check_content(content, path)

@@ -480,7 +480,7 @@ def read_scene_json(path: Path, classes: Classes | None = None) -> ScenePredicti
 
 def _read_scene_json(path: Path, *, scored: bool = True, flat: bool = False) -> NamedBoxes:
     if not path.exists():
-        raise DataError(f"no scene file at {path}; write one with `python -m raytran.predict`")
+        raise DataError(f"no scene file at {path}; write one with `raytran predict`")
     content = read_json_object(path)
     named = content.get("format")
     if named != FORMAT:

@@ -20,7 +20,7 @@ _log = logging.getLogger(__name__)
 
 
 def view(cfg: DictConfig) -> None:
-    """Run ``python -m raytran.view`` until it is interrupted; see ``conf/view.yaml``.
+    """Run ``raytran view`` until it is interrupted; see ``conf/view.yaml``.
 
     Raises:
         DataError: there is no result to show, or it is damaged.

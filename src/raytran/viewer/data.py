@@ -431,7 +431,7 @@ def find_scenes(folder: Path) -> dict[str, Path]:
         DataError: the folder is missing or holds none.
     """
     if not folder.is_dir():
-        raise DataError(f"no folder {folder}: give the output folder of `python -m raytran.predict`")
+        raise DataError(f"no folder {folder}: give the output folder of `raytran predict`")
     folder = folder.resolve()
     if (folder / SCENE).is_file():
         return {folder.name: folder}
@@ -444,7 +444,7 @@ def find_scenes(folder: Path) -> dict[str, Path]:
         below[:] = [] if finished else sorted(name for name in below if not name.startswith("."))
     if not scenes:
         raise DataError(
-            f"{folder} holds no {SCENE}: give the output folder of `python -m raytran.predict`, "
+            f"{folder} holds no {SCENE}: give the output folder of `raytran predict`, "
             "or one with such folders in it"
         )
     return dict(sorted(scenes.items())[:MAX_SCENES])

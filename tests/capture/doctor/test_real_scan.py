@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module", autouse=True)
 def features_once():
-    """What is spoiled is never an image: all copies have the same features, which take the longest to find."""
+    """What is spoiled is never an image: copies have the same features, which take the longest to find."""
     known = {}
 
     class Known(ORB):

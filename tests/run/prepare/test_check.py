@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``python -m raytran.prepare check=DIR``."""
+"""``raytran prepare check=DIR``."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def test_furniture_and_checks_are_passed_on(called):
 
 def test_commands_of_the_documentation_compose(project_root):
     text = (project_root / "docs" / "data.md").read_text(encoding="utf-8")
-    commands = re.findall(r"python -m raytran\.prepare ([^`\n]+)", text)
+    commands = re.findall(r"raytran prepare ([^`\n]+)", text)
     assert len(commands) >= 6
     for words in commands:
         compose("prepare", words.split())
@@ -119,7 +119,7 @@ def test_scans_without_annotation_from_the_command_line(tmp_path, caplog):
     said = [record.getMessage() for record in caplog.records]
     assert "found: scans 1 (exporter 1); no CAD models" in said[0]
     assert "scans 1, frames about 2; expect" in said[1]
-    assert said[-1] == f"python -m raytran.train data=scan2cad data.root={tmp_path / 'out'}"
+    assert said[-1] == f"raytran train data=scan2cad data.root={tmp_path / 'out'}"
 
 
 def test_captures_with_classes_of_ones_own_from_the_command_line(tmp_path, caplog):
@@ -136,7 +136,7 @@ def test_captures_with_classes_of_ones_own_from_the_command_line(tmp_path, caplo
     said = [record.getMessage() for record in caplog.records]
     assert any("to do: scans 1, frames about 4; expect" in text for text in said)
     assert said[-1] == (
-        f"python -m raytran.train data=boxes data.root={tmp_path / 'out'} 'classes.names=[drill,chair]'"
+        f"raytran train data=boxes data.root={tmp_path / 'out'} 'classes.names=[drill,chair]'"
     )
     unknown = [*typed[:4], "processes=1"]
     with pytest.raises(
@@ -164,7 +164,7 @@ def test_arkitscenes_and_its_classes_from_the_command_line(monkeypatch, caplog, 
     assert categories.unknown_left_out
     assert len(categories.classes) == 17
     assert passed_on["left_out"] == {"scans_without_boxes": [], "boxes_without_scan": ["1"]}
-    assert caplog.messages[-1] == "python -m raytran.train data=arkitscenes data.root=x classes=arkitscenes"
+    assert caplog.messages[-1] == "raytran train data=arkitscenes data.root=x classes=arkitscenes"
 
 
 def write_scan(folder):

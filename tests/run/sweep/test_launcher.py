@@ -55,7 +55,7 @@ main()
 
 @pytest.fixture
 def sweep(tmp_path, command):
-    """Run ``python -m raytran.train -m …`` in a folder of its own, with a script in place of each job."""
+    """Run ``raytran train -m …`` in a folder of its own, with a script in place of each job."""
     (tmp_path / "job.py").write_text(JOB)
     (tmp_path / "command.py").write_text(COMMAND)
 

@@ -129,7 +129,7 @@ def test_where_a_parent_is_looked_for(tmp_path):
     assert find(tmp_path, "stage2", "init_from=none") is None
     with pytest.raises(CheckpointError, match=r"no checkpoint at .*a\.ckpt"):
         find(tmp_path, "stage1", f"init_from={tmp_path / 'a.ckpt'}")
-    with pytest.raises(ConfigError, match=r"`python -m raytran\.train experiment=stage2 preset=tiny` first"):
+    with pytest.raises(ConfigError, match=r"`raytran train experiment=stage2 preset=tiny` first"):
         find(tmp_path, "stage3")
 
 
@@ -143,7 +143,7 @@ def test_a_parent_on_other_data_is_passed_over(tmp_path, old, caplog):
     assert " is on these data, 1 on others: " in said
     assert caplog.messages == [f"there is {other} on rooms in rooms"]
     assert (
-        "run `python -m raytran.train experiment=stage1 preset=tiny data=scan2cad data.root=real` first, "
+        "run `raytran train experiment=stage1 preset=tiny data=scan2cad data.root=real` first, "
         "or give init_from=CHECKPOINT, or"
     ) in said
     assert find(tmp_path, "stage2", *real, f"init_from={other}") == other

@@ -87,7 +87,7 @@ class DemoResult:
 
 
 def demo(cfg: DictConfig) -> DemoResult:
-    """Run ``python -m raytran.demo``; see ``conf/demo.yaml``.
+    """Run ``raytran demo``; see ``conf/demo.yaml``.
 
     Rooms and stages that an earlier run in the same folder finished are kept, an interrupted stage goes on;
     what follows from them takes seconds and is made anew.

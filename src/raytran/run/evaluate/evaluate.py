@@ -50,7 +50,7 @@ TASKS_OF_STAGE = {"stage3": TASKS_WITH_SHAPE, "novel_view": ("view",)}
 
 
 def evaluate(cfg: DictConfig) -> dict[str, Any]:
-    """Run ``python -m raytran.evaluate``; see ``conf/evaluate.yaml``.
+    """Run ``raytran evaluate``; see ``conf/evaluate.yaml``.
 
     Returns:
         The content of ``metrics.json``.
@@ -75,7 +75,7 @@ def evaluate(cfg: DictConfig) -> dict[str, Any]:
         console.print(table)
     _log.info("wrote %s: %s", output.resolve(), ", ".join(files))
     if cfg.checkpoint is not None:
-        _log.info("next: python -m raytran.predict SCENE %s", shlex.quote(f"checkpoint={cfg.checkpoint}"))
+        _log.info("next: raytran predict SCENE %s", shlex.quote(f"checkpoint={cfg.checkpoint}"))
     return evaluation.metrics
 
 

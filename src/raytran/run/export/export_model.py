@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write a network to a file that others can use: ``python -m raytran.export_model``."""
+"""Write a network to a file that others can use: ``raytran export_model``."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ _VIEWS_TRIED = 5
 
 
 def export_model(cfg: DictConfig) -> Path | None:
-    """Run ``python -m raytran.export_model``; see ``conf/export_model.yaml``.
+    """Run ``raytran export_model``; see ``conf/export_model.yaml``.
 
     Returns:
         The file that was written, None if there was only to say what is in the checkpoint.
 
     Raises:
-        ConfigError: a setting is unknown, ``output`` is the checkpoint itself or a folder, ``calibration`` is no
-            evaluation of it, or there is a page where the card belongs.
+        ConfigError: a setting is unknown, ``output`` is the checkpoint itself or a folder, ``calibration`` is
+            no evaluation of it, or there is a page where the card belongs.
         CheckpointError: the checkpoint is missing or damaged, or the file cannot be written.
     """
     source = checkpoint_path(cfg.checkpoint)

@@ -29,7 +29,7 @@ Objects of a room, with class, 9-DoF pose and mesh, from a posed RGB video: weig
 [RayTran](https://arxiv.org/abs/2203.13296) network for the program raytran.
 
 ```bash
-python -m raytran.predict checkpoint=hf:OWNER/NAME{file} scene=FOLDER output=prediction
+raytran predict checkpoint=hf:OWNER/NAME{file} scene=FOLDER output=prediction
 ```
 
 ```python

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What fits on a device, before anything is run: ``python -m raytran.plan``; see ``conf/plan.yaml``."""
+"""What fits on a device, before anything is run: ``raytran plan``; see ``conf/plan.yaml``."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ _SAME_PLACE = 1e-4
 
 
 def predict(cfg: DictConfig) -> Path:
-    """Run ``python -m raytran.predict``; see ``conf/predict.yaml``.
+    """Run ``raytran predict``; see ``conf/predict.yaml``.
 
     Returns:
         The folder of results.
@@ -260,7 +260,7 @@ def _check_channels(model: RayTran, checkpoint: str) -> None:
     if model.backbone.encoder.input_channels != RGB:
         raise ConfigError(
             f"{checkpoint} was trained with the true masks as a fourth channel, which only annotated scenes "
-            "have: use it with python -m raytran.evaluate, or give a checkpoint that was trained without"
+            "have: use it with raytran evaluate, or give a checkpoint that was trained without"
         )
 
 
@@ -279,6 +279,6 @@ def _report(output: Path, scene: PredictedScene, how_long: str) -> None:
         )
     _LOG.info("wrote %s: %s", output.resolve(), ", ".join(sorted(path.name for path in output.iterdir())))
     if scene.volumes is not None and has_viser():
-        _LOG.info("look at it: python -m raytran.view %s", shlex.quote(str(output)))
+        _LOG.info("look at it: raytran view %s", shlex.quote(str(output)))
     elif scene.volumes is not None:
         _LOG.info("no prediction.html to look at it: pip install 'raytran[viewer]'")

@@ -28,7 +28,7 @@ _PARENTS = 4
 
 
 def check(cfg: DictConfig) -> bool:
-    """Run ``python -m raytran.prepare check=DIR``; see ``conf/prepare.yaml``.
+    """Run ``raytran prepare check=DIR``; see ``conf/prepare.yaml``.
 
     Returns:
         whether nothing needs mending; the command exits with 1 otherwise.

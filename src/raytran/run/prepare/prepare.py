@@ -42,7 +42,7 @@ _PART = "it is of the test rooms of dataset=rooms-v1-furniture; training rooms n
 
 
 def prepare(cfg: DictConfig) -> Any:
-    """Run ``python -m raytran.prepare``; see ``conf/prepare.yaml``.
+    """Run ``raytran prepare``; see ``conf/prepare.yaml``.
 
     Returns:
         The report of what was written, or with ``check`` whether nothing needs mending.
@@ -114,7 +114,7 @@ def _prepare_rooms_v1_furniture(settings: dict[str, Any], output: Path) -> Any:
         output, cads=Path(settings["cads"]), processes=settings["processes"], **chosen
     )
     _log.info("%s\nthe rooms are in %s; evaluate on them with", report_on_rooms(report.root), report.root)
-    _log.info("python -m raytran.evaluate checkpoint=CKPT data=scan2cad %s split=test", _data_root(output))
+    _log.info("raytran evaluate checkpoint=CKPT data=scan2cad %s split=test", _data_root(output))
     return report
 
 
@@ -151,7 +151,7 @@ def _prepare_scan2cad(settings: dict[str, Any], output: Path) -> Any:
         processes=settings["processes"],
     )
     _log.info("\n%s\nthe scans are in %s; train on them with", prepared.text, prepared.root)
-    _log.info("python -m raytran.train data=scan2cad %s", _data_root(output))
+    _log.info("raytran train data=scan2cad %s", _data_root(output))
     return prepared
 
 
@@ -197,7 +197,7 @@ def _prepare_boxes(
     )
     _log.info("\n%s\nthe scans are in %s; train on them with", prepared.text, prepared.root)
     data = settings["dataset"]  # each has the configuration of its name
-    _log.info("python -m raytran.train data=%s %s%s", data, _data_root(output), _classes_as_typed(settings))
+    _log.info("raytran train data=%s %s%s", data, _data_root(output), _classes_as_typed(settings))
     return prepared
 
 

@@ -32,7 +32,7 @@ _OWN = ("stages", "output_dir", "resume")
 
 
 def curriculum(cfg: DictConfig) -> list[FitResult]:
-    """Run ``python -m raytran.curriculum``: the overrides typed there hold for every stage."""
+    """Run ``raytran curriculum``: the overrides typed there hold for every stage."""
     overrides = [
         item for item in typed_settings(HydraConfig.get()) if item.split("=")[0].lstrip("+~") not in _OWN
     ]
@@ -54,7 +54,7 @@ def run_curriculum(
     that was interrupted goes on from its last checkpoint.
 
     Args:
-        overrides: settings for all stages as typed after ``python -m raytran.train``, without ``experiment``.
+        overrides: settings for all stages as typed after ``raytran train``, without ``experiment``.
         output_dir: folder of the curriculum.
         stages: experiments, in order.
         of_stage: settings of single stages, by experiment, that win over ``overrides``.

@@ -33,10 +33,10 @@ def tell_after_stage(cfg: DictConfig, result: FitResult) -> None:
     data = DataIdentity.of_config(plain(cfg)).typed()
     outputs = [] if cfg.outputs == "outputs" else [shlex.quote(f"outputs={cfg.outputs}")]
     words = [f"experiment={following}", f"preset={cfg.preset}", *([data] if data else []), *outputs]
-    _log.info("next: python -m raytran.train %s", " ".join(words))
+    _log.info("next: raytran train %s", " ".join(words))
 
 
 def tell_use(checkpoint: Path) -> None:
     """Log what a finished network is good for."""
     typed = shlex.quote(f"checkpoint={checkpoint}")
-    _log.info("next: python -m raytran.evaluate %s, or python -m raytran.predict SCENE %s", typed, typed)
+    _log.info("next: raytran evaluate %s, or raytran predict SCENE %s", typed, typed)

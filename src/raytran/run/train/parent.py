@@ -59,7 +59,7 @@ def find_parent(run: RunConfig, stage: Stage, data: DataIdentity) -> tuple[Path,
 
 def _no_parent(run: RunConfig, stage: Stage, data: DataIdentity, *, number_of_others: int) -> str:
     runs = f"no finished run of {stage.parent} with preset {run.preset} in outputs={run.outputs}"
-    first = f"`python -m raytran.train experiment={stage.parent_experiment} preset={run.preset}"
+    first = f"`raytran train experiment={stage.parent_experiment} preset={run.preset}"
     otherwise = "or give init_from=CHECKPOINT, or init_from=none to start from scratch"
     if not number_of_others:
         return f"{runs}: run {first}` first, {otherwise}"
