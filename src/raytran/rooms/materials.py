@@ -233,7 +233,7 @@ def grain(rng: np.random.Generator) -> NDArray[np.float64]:
 def blocks(
     rng: np.random.Generator, rows: int, columns: int, shift: float, gap: float
 ) -> NDArray[np.float64]:
-    """Return ``(SIZE, SIZE)``: blocks of differing grey, dark joints of ``gap`` row heights between them."""
+    """Return ``(SIZE, SIZE)``: staggered grey blocks with dark joints of ``gap`` of a row's height."""
     v, u = np.meshgrid(np.arange(SIZE) * rows / SIZE, np.arange(SIZE) * columns / SIZE, indexing="ij")
     row = v.astype(int)
     u = u + row * shift
