@@ -2,8 +2,8 @@
 """Makes a site of the pages, which are written to be read in a clone: a hook of MkDocs, see ``mkdocs.yml``.
 
 In a clone pages link to each other by relative paths, also to what lies outside of ``docs/``: conventions,
-notebooks, sources. Here these become pages too (a source file the page of its module), and links lead to them;
-links to files that no page is made of become plain names.
+notebooks, sources. Here these become pages too (a source file the page of its module), and links lead to
+them; links to files that no page is made of become plain names.
 """
 
 from __future__ import annotations

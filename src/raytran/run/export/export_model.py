@@ -48,8 +48,8 @@ def export_model(cfg: DictConfig) -> Path | None:
         The file that was written, None if there was only to say what is in the checkpoint.
 
     Raises:
-        ConfigError: a setting is unknown, ``output`` is the checkpoint itself or a folder, ``calibration`` is no
-            evaluation of it, or there is a page where the card belongs.
+        ConfigError: a setting is unknown, ``output`` is the checkpoint itself or a folder, ``calibration`` is
+            no evaluation of it, or there is a page where the card belongs.
         CheckpointError: the checkpoint is missing or damaged, or the file cannot be written.
     """
     source = checkpoint_path(cfg.checkpoint)
