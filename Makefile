@@ -14,8 +14,8 @@ install: $(VENV)/.installed  ## Make the virtual environment in .venv with every
 # On Linux torch from PyPI brings CUDA, 3 GB to download. Without a GPU its build for CPUs does, if pip finds it:
 #   make install PIP_EXTRA_INDEX_URL=https://download.pytorch.org/whl/cpu
 $(VENV)/.installed: pyproject.toml requirements/ci.txt
-	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' || \
-		{ echo "raytran needs Python 3.11 to 3.13; name one with: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))' || \
+		{ echo "raytran needs Python 3.11 to 3.14; name one with: make PYTHON=python3.12 $(MAKECMDGOALS)"; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --no-compile --requirement requirements/ci.txt
 	@$(BIN)/python -m compileall -qq -j 0 $(VENV)/lib src || true  # on all cores; some packages bring templates

@@ -98,7 +98,7 @@ def test_the_pages_that_messages_name_are_inside(site: Path, project_root: Path,
     assert (site / "raytran" / "CONVENTIONS.md").is_file()
     assert not list((site / "raytran" / "docs").rglob("*.py"))
     shown = run(site, tmp_path, "-m", "raytran.predict", "--help")
-    assert f"docs/… below lie in {site / 'raytran' / 'docs'}\n" in shown.stdout
+    assert f"The folder docs/ is {site / 'raytran' / 'docs'}\n" in shown.stdout
 
 
 def test_the_page_of_an_index_links_to_nothing_that_is_not_there(site: Path) -> None:

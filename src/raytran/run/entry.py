@@ -31,7 +31,7 @@ from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from raytran.checkpoints.runs import first_ranks, run_folder
 from raytran.data.files import disk_full
 from raytran.data.workers import ENDS_WITH, end_with_parent
-from raytran.errors import ConfigError, DataError, RaytranError, page
+from raytran.errors import ConfigError, DataError, RaytranError
 from raytran.run.closed_pipe import survive_closed_pipe
 from raytran.run.config_dir import config_dir
 from raytran.run.help_page import help_page
@@ -397,13 +397,9 @@ def _exit_with(error: RaytranError) -> None:
 
 
 def register_resolvers() -> None:
-    """Make the resolvers of the configs known.
-
-    ``${run_folder:…}`` is evaluated once per command, by the first rank; ``${pages:}`` is where ``docs/`` is.
-    """
+    """Make ``${run_folder:…}`` known to the configs; evaluated once per command, by the first rank."""
 
     def resolve(*arguments: str) -> str:
         return first_ranks(f"the folder of {' '.join(arguments)}", lambda: run_folder(*arguments))
 
     OmegaConf.register_new_resolver("run_folder", resolve, use_cache=True, replace=True)
-    OmegaConf.register_new_resolver("pages", lambda: page("."), replace=True)

@@ -12,12 +12,16 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from raytran.errors import page
 from raytran.run.conf_comments import Choice, Option, choices, header, options
 from raytran.run.config_dir import config_dir
 
 _NO_SETTINGS = ("_target_", "_partial_", "_convert_")
 _OWN_RESOLVERS = re.compile(r"\$\{(?!oc\.)[\w.]+:")
 """References to what is only known when a command runs, e.g. the folder of a new run."""
+
+_PAGE = re.compile(r"docs/[\w/-]+\.md")
+_WHERE_PAGES_ARE = "The folder docs/ is "
 
 _SETTING_WIDTH = 36
 _FEWEST_COLUMNS = 60
@@ -44,10 +48,11 @@ def help_page(command: str, cfg: DictConfig, *, width: int) -> str:
             files = sorted(path.stem for path in (config_dir() / group).glob("*.yaml"))
             groups[group] = Choice(group, tuple(files), (str(name),), False, "")
     template: str = OmegaConf.to_container(cfg.hydra.help, resolve=False)["template"]  # type: ignore[index, call-overload]
-    return Template(template).safe_substitute(
+    text = Template(template).safe_substitute(
         APP_CONFIG_GROUPS="\n".join(_group_lines(groups, chosen, width)),
         CONFIG="\n".join(_setting_lines(roots, chosen, cfg, width)),
     )
+    return f"{text.rstrip()}\n\n{_WHERE_PAGES_ARE}{page('.')}\n" if _PAGE.search(text) else text
 
 
 def _root_files(command: str) -> list[str]:
