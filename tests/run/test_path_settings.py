@@ -123,6 +123,7 @@ SIGNS = (
     "CSV",
 )
 NO_PATHS = {
+    "card": "a switch",
     "trust": "names of packages",
     "protocol": "a name",
     "scenes": "names of scans",

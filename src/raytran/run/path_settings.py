@@ -44,7 +44,7 @@ PATH_SETTINGS = {
         *("check", "output", "cads", "scannet", "shapenet", "scan2cad", "source"),
         *("captures", "boxes", "arkitscenes"),
     ),
-    "export_model": ("checkpoint", "output"),
+    "export_model": ("checkpoint", "output", "calibration"),
     "plan": ("scene", "model.backbone.encoder.weights"),
     "view": ("folder",),
     "demo": ("output",),

@@ -24,7 +24,8 @@ class LiveBar(Progress):
     """
 
     def __init__(self, *columns: ProgressColumn) -> None:
-        super().__init__(*columns, refresh_per_second=4)
+        # Not rich's own console, which keeps what it was told of the terminal when it was first asked for.
+        super().__init__(*columns, console=Console(), refresh_per_second=4)
         self._redirected: list[tuple[logging.StreamHandler[Any], Any]] = []
 
     def start(self) -> None:

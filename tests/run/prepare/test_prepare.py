@@ -87,7 +87,7 @@ def test_commands_of_the_documentation_compose(project_root):
         (("dataset=rooms-v1", "output=x", "part=all"), "leave out part="),
         (
             ("dataset=scannet", "output=x"),
-            "choose one of rooms, rooms-v1, rooms-v1-furniture, scan2cad, boxes, arkitscenes, cads",
+            "choose one of rooms, rooms-v1, rooms-v1-furniture, rooms-v2, scan2cad, boxes, arkitscenes, cads",
         ),
         (("dataset=scan2cad", "output=x"), "scannet= is missing"),
         (("dataset=cads", "output=x"), "source= is missing"),

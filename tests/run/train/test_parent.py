@@ -14,14 +14,13 @@ from raytran.checkpoints.runs import LAST, write_finished
 from raytran.errors import CheckpointError, ConfigError
 from raytran.run.entry import compose
 from raytran.run.train.build import plain
-from raytran.run.train.fit import _stage
-from raytran.run.train.parent import find_parent
+from raytran.run.train.parent import find_parent, stage_of
 from raytran.run.train.settings import RunConfig
 from raytran.training.callbacks.stage import Parent, check_parent
 
 
 def stage(experiment, *more):
-    return _stage(compose("train", ["preset=tiny", f"experiment={experiment}", "output_dir=unused", *more]))
+    return stage_of(compose("train", ["preset=tiny", f"experiment={experiment}", "output_dir=unused", *more]))
 
 
 def parent(name, **scores):
@@ -109,7 +108,7 @@ def test_what_is_remembered_of_a_parent():
 def find(outputs, experiment, *more):
     settings = ["preset=tiny", f"experiment={experiment}", "output_dir=unused", f"outputs={outputs}", *more]
     cfg = compose("train", settings)
-    found = find_parent(RunConfig.read(cfg), _stage(cfg), DataIdentity.of_config(plain(cfg)))
+    found = find_parent(RunConfig.read(cfg), stage_of(cfg), DataIdentity.of_config(plain(cfg)))
     return None if found is None else found[0]
 
 
