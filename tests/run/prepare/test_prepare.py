@@ -85,6 +85,7 @@ def test_commands_of_the_documentation_compose(project_root):
         (("dataset=rooms-v1-furniture", "output=x", "cads=y", "part=train"), "one of all, held_out"),
         (("dataset=rooms", "output=x", "part=held_out"), "leave out part="),
         (("dataset=rooms-v1", "output=x", "part=all"), "leave out part="),
+        (("dataset=rooms-v2", "output=x", "part=all"), "leave out part="),
         (
             ("dataset=scannet", "output=x"),
             "choose one of rooms, rooms-v1, rooms-v1-furniture, rooms-v2, scan2cad, boxes, arkitscenes, cads",

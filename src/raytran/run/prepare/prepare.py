@@ -121,6 +121,7 @@ def _prepare_rooms_v1_furniture(settings: dict[str, Any], output: Path) -> Any:
 def _prepare_rooms_v2(settings: dict[str, Any], output: Path) -> Any:
     _refuse(settings, *_FREE_ONLY, because=_FIXED)
     _refuse(settings, "num_test", because="rooms-v2 has no test rooms, rooms-v1 has")
+    _refuse(settings, "part", because=_PART)
     report = generate_rooms_v2(
         output,
         cads=_path(settings["cads"]),
