@@ -24,8 +24,18 @@ LAYERS: list[set[str]] = [
     {"export", "training"},
     {"rooms", "capture", "viewer"},
     {"run"},
-    {"train", "curriculum", "evaluate", "predict", "prepare", "plan", "demo", "view", "export_model"},
-    {"__main__"},
+    {
+        "train",
+        "curriculum",
+        "evaluate",
+        "predict",
+        "prepare",
+        "plan",
+        "demo",
+        "view",
+        "export_model",
+        "__main__",
+    },
 ]
 RANK = {name: rank for rank, names in enumerate(LAYERS) for name in names}
 WINGS = {"rooms", "capture", "viewer"}

@@ -57,6 +57,7 @@ def test_the_list_loads_neither_torch_nor_hydra(tmp_path):
         ("evalute", "there is no verb evalute: is evaluate meant?"),
         ("eval", "is evaluate meant?"),
         ("export", "is export_model meant?"),
+        ("test", "there is no verb test: is evaluate meant?"),
         ("xyzzy", "there is no verb xyzzy: raytran alone lists the verbs"),
         ("preset=tiny", "a verb comes first, as in raytran train preset=tiny"),
         (".", ". is a path and no verb: is raytran predict . meant?"),

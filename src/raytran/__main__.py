@@ -31,6 +31,15 @@ _EXAMPLES = (
     ("raytran train experiment=stage2 preset=tiny", "settings are key=value"),
     ("raytran VERB --help", "all settings of a command"),
 )
+_ELSEWHERE = {
+    **dict.fromkeys(("test", "val", "validate", "score"), "evaluate"),
+    **dict.fromkeys(("infer", "inference", "detect", "run"), "predict"),
+    **dict.fromkeys(("show", "viewer", "open"), "view"),
+    **dict.fromkeys(("check", "data", "doctor"), "prepare"),
+    **dict.fromkeys(("fit", "finetune"), "train"),
+}
+"""What other programs call such commands."""
+
 _COMPLETION = ("-sc", "--shell-completion")
 _ANY = "view"
 """A command to ask for what all have; it has the fewest settings."""
@@ -87,7 +96,8 @@ def _no_verb(word: str) -> str:
     if "=" in word or word.startswith("-"):
         return f"a verb comes first, as in raytran train {word}: {lists}"
     begun = [verb for verb in VERBS if verb.startswith(word)]
-    meant = begun or get_close_matches(word, VERBS, n=2, cutoff=0.6)
+    other = [_ELSEWHERE[word]] if word in _ELSEWHERE else []
+    meant = other or begun or get_close_matches(word, VERBS, n=2, cutoff=0.6)
     question = f"is {' or '.join(meant)} meant? " if meant else ""
     return f"there is no verb {word}: {question}{lists}"
 

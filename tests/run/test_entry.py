@@ -112,6 +112,7 @@ def test_a_defect_keeps_its_traceback():
         ("trainer.maxsteps=3", "is trainer.max_steps meant?"),
         ("nothing.like.it=3", "there is no setting nothing.like.it: --help lists all"),
         ("seed", "key=value"),
+        ("lr=0.1", "there is no setting lr: is optimizer.learning_rate meant?"),
         ("expriment=stage1", "is experiment meant?"),
         ("--seed=3", "there is no option --seed: settings are written without dashes, as seed=VALUE"),
         ("seed=abc", "seed=abc is no number: give one, as in seed=0"),
@@ -176,7 +177,9 @@ def test_a_path_without_a_key_gets_one(name, typed, meant):
 
 @pytest.mark.parametrize("words", [["a", "b"], ["a", "scene=b"], ["scene=b", "a"]])
 def test_two_paths_without_a_key_are_not_guessed(words):
-    with pytest.raises(ConfigError, match="is a path without a name, and scene= is there already"):
+    with pytest.raises(
+        ConfigError, match="is a path without a name, and scene= is there already: name it, as in output="
+    ):
         with_keys("predict", words)
 
 

@@ -26,6 +26,8 @@ def choose_device(name: str) -> torch.device:
         torch.empty(0, device=device)
     except (RuntimeError, AssertionError) as error:
         reason = str(error).splitlines()[0]
+        if reason.startswith("Expected one of"):  # torch lists all it has ever known
+            reason = "there is none of that name; a GPU is cuda, or cuda:1"
         raise ConfigError(f"cannot use device={name} ({reason}): choose auto or cpu") from error
     return device
 

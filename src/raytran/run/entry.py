@@ -36,7 +36,7 @@ from raytran.run.closed_pipe import survive_closed_pipe
 from raytran.run.config_dir import config_dir
 from raytran.run.help_page import help_page
 from raytran.run.lazy_help import let_help_be_lazy
-from raytran.run.path_settings import check_run_folder, key_of_path, literal_paths, quoted
+from raytran.run.path_settings import PATH_SETTINGS, check_run_folder, key_of_path, literal_paths, quoted
 from raytran.run.refused_run import remove_refused_run
 from raytran.run.setting_mistakes import (
     KEY,
@@ -354,12 +354,13 @@ def with_keys(command: str, words: Sequence[str]) -> list[str]:
     """
     named: list[str] = []
     before = ""
+    other = "output" if "output" in PATH_SETTINGS.get(command, ()) else "KEY"
     for word in words:
         is_other = word.startswith("-") or before in _WITH_VALUE or _is_setting(word)
         key = None if is_other else key_of_path(command, word)
-        if key is not None and any(other.startswith(f"{key}=") for other in (*named, *words)):
+        if key is not None and any(given.startswith(f"{key}=") for given in (*named, *words)):
             raise ConfigError(
-                f"{word} is a path without a name, and {key}= is there already: name it, KEY={word}"
+                f"{word} is a path without a name, and {key}= is there already: name it, as in {other}={word}"
             )
         named.append(word if key is None else f"{key}={quoted(word)}")
         before = word

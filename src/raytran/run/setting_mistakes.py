@@ -53,6 +53,18 @@ _UNKNOWN = re.compile(r"Could not override '(.*)'$")
 
 _MOST_SUGGESTIONS = 3
 
+_ELSEWHERE = {
+    **dict.fromkeys(("lr", "learning_rate"), ("optimizer.learning_rate",)),
+    **dict.fromkeys(("epochs", "max_epochs", "steps", "iterations"), ("trainer.max_steps",)),
+    **dict.fromkeys(("gpus", "num_gpus", "devices"), ("trainer.devices",)),
+    **dict.fromkeys(("workers", "num_workers"), ("views.num_workers",)),
+    **dict.fromkeys(("batch", "batch_size"), ("views.batch_size",)),
+    **dict.fromkeys(("ckpt", "weights"), ("checkpoint", "init_from")),
+    **dict.fromkeys(("input", "video", "source"), ("scene",)),
+    **dict.fromkeys(("out", "out_dir", "save_dir"), ("output", "output_dir")),
+}
+"""What other programs call such settings → what they may be called here."""
+
 _NOT_OURS = ("hydra.", "trainer.", "logger.")
 """Settings of other packages, which take words and numbers as they say."""
 
@@ -99,6 +111,8 @@ def _similar_settings(typed: str, known: Callable[[], DictConfig]) -> list[str]:
     except ConfigError:
         return []
     names = list(_dotted(content))
+    if other := [name for name in _ELSEWHERE.get(typed, ()) if name in names]:
+        return other
     last = typed.rpartition(".")[2]
     same = [setting for setting in names if setting.rpartition(".")[2] == last]
     return same if 0 < len(same) <= _MOST_SUGGESTIONS else get_close_matches(typed, names, n=1, cutoff=0.75)

@@ -147,6 +147,16 @@ def test_results_have_a_place_of_their_own(scene, oracle, tmp_path, monkeypatch)
     assert (tmp_path / written / "scene.json").is_file()
 
 
+def test_a_scene_that_is_refused_leaves_no_folder(oracle, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "0.jpg").touch()
+    for path in ("photos", "nowhere"):
+        with pytest.raises(DataError):
+            module.predict(OmegaConf.merge(config(path, "x"), {"output": None}))
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
 def test_all_files_are_written(scene, oracle, tmp_path):
     output = module.predict(config(scene, tmp_path / "out" / "room"))
     content = json.loads((output / "scene.json").read_text())

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import shlex
 import time
@@ -20,7 +21,7 @@ from raytran.checkpoints.file import checkpoint_path, shipped_weights
 from raytran.checkpoints.load import PredictionSettings, load_model, prediction_settings
 from raytran.checkpoints.network import trusted_packages
 from raytran.data.shapenet.models import shapenet_version
-from raytran.errors import ConfigError
+from raytran.errors import ConfigError, DataError
 from raytran.export.simplify import MESH_ERROR
 from raytran.model import RayTran
 from raytran.postprocess import count_object_views, merge_volumes, select_objects
@@ -81,8 +82,19 @@ def predict(cfg: DictConfig) -> Path:
     intrinsics = parse_intrinsics(cfg.intrinsics)
     check_choice(cfg.frames, cfg.num_views)
     check_pictures(num_overlays=cfg.num_overlays, turntable=cfg.turntable)
-    with one_writer(output, marker=MARKER):
-        device, scene = _predict(cfg, recording, output, world, intrinsics)
+    try:
+        recording.stat()  # before the network is loaded
+    except FileNotFoundError as error:
+        raise DataError(f"there is no scene {recording}: check the path") from error
+    try:
+        with one_writer(output, marker=MARKER):
+            device, scene = _predict(cfg, recording, output, world, intrinsics)
+    except BaseException:
+        if not cfg.output:
+            with contextlib.suppress(OSError):
+                PREDICTIONS.rmdir()  # if nothing else is there
+                PREDICTIONS.parent.rmdir()
+        raise
     _report(output, scene, f"in {time.monotonic() - began:.0f} s on {device_name(device)}")
     return output
 
