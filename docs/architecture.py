@@ -33,9 +33,8 @@ COLUMNS: tuple[dict[str, str], ...] = (
     dict.fromkeys(
         ("train", "curriculum", "evaluate", "predict", "prepare", "plan", "demo", "view", "export_model"), ""
     ),
-    {"__main__": "raytran VERB"},
 )
-"""Folders and files from left to right, each with what it holds; before the last one the commands."""
+"""Folders and files from left to right, each with what it holds; the last column are the commands."""
 
 WINGS = {
     "rooms": "generated rooms\nand furniture",
