@@ -46,8 +46,15 @@ format: install  ## Rewrite the sources in the project's format
 	$(BIN)/ruff format src tests benchmarks docs notebooks
 	$(BIN)/ruff check --fix src tests benchmarks docs notebooks
 
-docs: install  ## Write the tables of settings into docs/ from conf/
+docs: install build/docs/.installed  ## Write the tables of settings into docs/ from conf/, and the site into build/site
 	$(BIN)/python docs/options.py
+	NO_MKDOCS_2_WARNING=1 build/docs/bin/mkdocs build --strict
+
+# The extra "docs" without raytran itself and torch: the site is made of sources, which nothing imports.
+build/docs/.installed: pyproject.toml
+	$(PYTHON) -m venv build/docs
+	build/docs/bin/pip install --quiet $$($(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["docs"])')
+	@touch $@
 
 notebooks: install  ## Execute the notebooks and keep what they print and draw
 	OMP_NUM_THREADS=1 $(BIN)/python notebooks/execute.py

@@ -92,7 +92,7 @@ def linked(text: str, source: str, page: str, made: Mapping[str, str]) -> str:
         to = relpath(there, PurePosixPath(page).parent)
         return f"{found[1]}[{found[2]}]({to}{'#' * bool(anchor)}{anchor})"
 
-    # Code stays as it is; in a link's text it is part of the link.
+    # Code stays as it is, also in the text of a link.
     kept: list[str] = []
 
     def keep(found: re.Match[str]) -> str:

@@ -108,3 +108,25 @@ def test_every_python_and_address_is_told(project, pythons):
     told = {text.rpartition(" ")[2] for text in project["classifiers"] if "Python :: 3." in text}
     assert told == set(pythons)
     assert all(address.startswith("https://") for address in project["urls"].values())
+
+
+def test_the_container_has_a_python_and_extras_that_there_are(project, pythons, project_root):
+    text = (project_root / "Dockerfile").read_text()
+    assert re.search(r"^FROM python:(3\.\d+)-", text, re.M)[1] in pythons
+    extras = re.findall(r"--extra (\w+)", text)
+    assert extras
+    assert set(extras) <= project["optional-dependencies"].keys()
+    allowed = {
+        line[1:] for line in (project_root / ".dockerignore").read_text().splitlines() if line[0] == "!"
+    }
+    built_from = {
+        "pyproject.toml",
+        "uv.lock",
+        "README.md",
+        "LICENSE",
+        "CONVENTIONS.md",
+        "src",
+        "conf",
+        "docs",
+    }
+    assert allowed == built_from
