@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The site of the pages: nothing is left out of its navigation, and links written for a clone lead to its pages."""
+"""The site of the pages: its navigation leaves nothing out, and links of a clone lead to its pages."""
 
 from __future__ import annotations
 
