@@ -22,6 +22,7 @@ from raytran.checkpoints.load import PredictionSettings, load_model, prediction_
 from raytran.checkpoints.network import trusted_packages
 from raytran.data.shapenet.models import shapenet_version
 from raytran.errors import ConfigError, DataError
+from raytran.export.rerun_file import check_rerun
 from raytran.export.simplify import MESH_ERROR
 from raytran.model import RayTran
 from raytran.postprocess import count_object_views, merge_volumes, select_objects
@@ -81,6 +82,8 @@ def predict(cfg: DictConfig) -> Path:
     world = WorldSettings(up=cfg.up, scale=cfg.scale, convention=cfg.convention, check=cfg.check)
     intrinsics = parse_intrinsics(cfg.intrinsics)
     check_choice(cfg.frames, cfg.num_views)
+    if cfg.rerun:
+        check_rerun()
     check_pictures(num_overlays=cfg.num_overlays, turntable=cfg.turntable)
     try:
         recording.stat()  # before the network is loaded
@@ -142,6 +145,7 @@ def _predict(
         num_overlays=cfg.num_overlays,
         turntable=cfg.turntable,
         obj=cfg.obj,
+        rerun=cfg.rerun,
         truth=truth,
     )
     if new_cameras is not None:

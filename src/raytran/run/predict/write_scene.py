@@ -15,6 +15,7 @@ from raytran.export import write_prediction
 from raytran.export.cad_alignments import ALIGNMENTS, write_alignments_csv
 from raytran.export.glb import write_glb
 from raytran.export.nearest_cad import NearestCads, nearest_cads
+from raytran.export.rerun_file import write_rerun
 from raytran.export.simplify import MESH_ERROR, simplify
 from raytran.geometry.camera import Cameras
 from raytran.pictures.overlay import draw_overlays
@@ -142,6 +143,7 @@ def write_scene(
     num_overlays: int = 4,
     turntable: int = 24,
     obj: bool = False,
+    rerun: bool = False,
     truth: ObjectSet | None = None,
 ) -> None:
     """Write what ``docs/outputs.md`` lists, all or nothing.
@@ -154,6 +156,7 @@ def write_scene(
         num_overlays: frames to draw over.
         turntable: pictures of the turn in ``turntable.gif``; 0: there is none.
         obj: write each mesh as OBJ too.
+        rerun: write ``scene.rrd`` too.
         truth: annotated objects to draw in the plan and to compare with, or None.
 
     Raises:
@@ -178,6 +181,8 @@ def write_scene(
             write_glb(folder / "cads.glb", prediction.objects, scene.cads.meshes())
         if views is not None and scene.volumes is not None:
             write_viewer_data(folder, views, frame_ids, volumes=scene.volumes, truth=truth)
+        if rerun:
+            write_rerun(folder / "scene.rrd", prediction, scene.meshes, views, frame_ids)
         write_prediction(folder, prediction, scene.meshes, cameras=cameras, frame_ids=frame_ids, obj=obj)
         if views is not None and scene.volumes is not None and has_viser():
             # Here, since the package that draws is an extra.
