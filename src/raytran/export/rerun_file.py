@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A prediction as a recording of Rerun (extra ``rerun``): boxes, meshes, and a camera with its frames in time.
+"""A prediction as a recording of Rerun (extra ``rerun``): boxes, meshes, a camera with its frames in time.
 
 Everything is in the world of the input poses: metres, right-handed, +Z up.
 """
