@@ -25,6 +25,16 @@ def test_a_device_that_is_not_there_is_one_sentence():
 
 
 @pytest.mark.parametrize(
+    ("cuda", "apple", "chosen"),
+    [(True, True, "cuda"), (True, False, "cuda"), (False, True, "mps"), (False, False, "cpu")],
+)
+def test_auto_is_the_best_there_is(cuda, apple, chosen, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: apple)
+    assert choose_device("auto") == torch.device(chosen)
+
+
+@pytest.mark.parametrize(
     ("name", "device", "products", "convolutions"),
     [
         ("auto", GPU, "high", True),

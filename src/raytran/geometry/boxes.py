@@ -11,6 +11,7 @@ from torch import Tensor
 
 from raytran.errors import ShapeError, check_shape
 from raytran.geometry.box_clip import cube_intersection
+from raytran.geometry.double import widest
 
 _PAIRS_PER_CHUNK_CPU = 512  # keeps the arrays of a chunk in the cache
 _PAIRS_PER_CHUNK = 65_536  # about 1.5 GB
@@ -100,8 +101,7 @@ def box_iou(a: OrientedBoxes, b: OrientedBoxes) -> tuple[Tensor, Tensor]:
     """
     check_shape(a.center, "A 3", "center of the first boxes")
     check_shape(b.center, "B 3", "center of the second boxes")
-    dtype = torch.float32 if a.center.device.type == "mps" else torch.float64
-    return _box_iou(a, b, dtype)
+    return _box_iou(a, b, widest(a.center.device))
 
 
 def axis_aligned_iou(a: OrientedBoxes, b: OrientedBoxes) -> Tensor:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from raytran.errors import DataError, check_shape
 from raytran.geometry.camera import FARTHEST_CENTER
+from raytran.geometry.double import widest
 from raytran.structs import Views
 
 _SKEWED = 0.01
@@ -23,7 +24,7 @@ def rigid_motions(pose: Tensor) -> Tensor:
     Reflections are none: their determinant is -1. Nothing here makes the host wait for a GPU.
     """
     finite = pose.isfinite().all(dim=-1).all(dim=-1)
-    rotation = pose[..., :3, :3].where(finite[..., None, None], 0.0).double()
+    rotation = pose[..., :3, :3].where(finite[..., None, None], 0.0).to(widest(pose.device))
     eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
     error = (rotation @ rotation.mT - eye).abs().amax(dim=(-2, -1))
     x, y, z = rotation.unbind(dim=-2)

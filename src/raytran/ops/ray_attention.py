@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from raytran.errors import check_shape
+from raytran.geometry.double import place_with_double
 from raytran.ops.pairs import PairList, Pairs, pairs_for
 from raytran.ops.sparse import pair_attention
 
@@ -137,5 +138,7 @@ def _attend(
         return out.to(query.dtype), logsumexp, True
     dtype = torch.promote_types(dtype, torch.float32)
     by_target, by_source = pairs.orders("voxels" if to_voxels else "pixels")
-    out, logsumexp = pair_attention(query.to(dtype), key.to(dtype), value.to(dtype), by_target, by_source)
-    return out.to(query.dtype), logsumexp, False
+    place = place_with_double(query.device)
+    qkv = (part.to(place, dtype) for part in (query, key, value))
+    out, logsumexp = pair_attention(*qkv, by_target, by_source)
+    return out.to(query.device, query.dtype), logsumexp.to(query.device), False

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from raytran.errors import check_shape
+from raytran.geometry.double import place_with_double
 from raytran.ops.pairs import PairList, PairOrder, Pairs, pairs_for
 from raytran.ops.sparse import sparse_product
 
@@ -43,9 +44,11 @@ def splat_features(features: Tensor, pairs: Pairs) -> tuple[Tensor, Tensor]:
         return mean.to(features.dtype), count > 0
     dtype = torch.promote_types(features.dtype, torch.float32)
     by_voxel, by_pixel = pairs.orders("voxels")
-    with torch.autocast(features.device.type, enabled=False):
-        mean = _mean(features.to(dtype), list(by_voxel), list(by_pixel))
-    return mean.to(features.dtype), by_voxel.row_offsets.diff() > 0
+    place = place_with_double(features.device)
+    with torch.autocast(place.type, enabled=False):
+        mean = _mean(features.to(place, dtype), list(by_voxel), list(by_pixel))
+    is_seen = by_voxel.row_offsets.diff() > 0
+    return mean.to(features.device, features.dtype), is_seen.to(features.device)
 
 
 def splat_in_chunks(features: Sequence[Tensor], pairs: Sequence[Pairs]) -> tuple[Tensor, Tensor]:
@@ -66,7 +69,7 @@ def splat_in_chunks(features: Sequence[Tensor], pairs: Sequence[Pairs]) -> tuple
     with torch.no_grad():
         for chunk, of_chunk in zip(features, pairs, strict=True):
             mean, _ = splat_features(chunk, of_chunk)
-            pixels_per_voxel = of_chunk.pixels_per_voxel()
+            pixels_per_voxel = of_chunk.pixels_per_voxel().to(total.device)
             total += mean.to(dtype) * pixels_per_voxel[:, None]
             count += pixels_per_voxel
     mean = total / count.clamp(min=1)[:, None]

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from raytran.errors import ConfigError, ShapeError, check_shape
 from raytran.geometry.camera import Cameras
+from raytran.geometry.double import place_with_double
 from raytran.geometry.grid import VoxelGrid
 from raytran.ops.pairs import PairList, Pairs, interpreted, why_no_kernels
 from raytran.structs import HostCopy
@@ -78,11 +79,13 @@ def trace_pairs(
         rays_per_cell: n; a pixel casts n×n rays and is paired with every voxel that one of them crosses.
 
     Returns:
-        One list for the whole batch, on the device of the cameras.
+        One list for the whole batch, on the device of the cameras; for Apple's GPUs on the CPU, see
+        ``place_with_double``.
 
     Raises:
         ShapeError: cameras and grid have other leading shapes.
     """
+    cameras = cameras.to(place_with_double(cameras.intrinsics.device))
     origin, direction = voxel_rays(cameras, grid, feature_size, rays_per_cell)
     rays, scenes = _rays_in_grid(origin, direction, grid.resolution), origin.shape[:-2].numel()
     rays_per_pixel = rays_per_cell**2
@@ -127,6 +130,8 @@ def count_views(
         ShapeError: cameras or grid have other leading shapes.
     """
     check_shape(cameras.intrinsics, "N 3 3", "intrinsics")
+    device = cameras.intrinsics.device
+    cameras = cameras.to(place_with_double(device))
     counts = torch.zeros(grid.num_voxels, dtype=torch.int32, device=cameras.intrinsics.device)
     for start in range(0, len(cameras.intrinsics), _VIEWS_AT_ONCE):
         some = cameras[start : start + _VIEWS_AT_ONCE]
@@ -135,7 +140,7 @@ def count_views(
         met = torch.zeros(len(some.intrinsics), grid.num_voxels, dtype=torch.bool, device=counts.device)
         met[view, pairs.voxel_index] = True
         counts += met.sum(dim=0, dtype=torch.int32)
-    return counts.view(grid.resolution)
+    return counts.view(grid.resolution).to(device)
 
 
 def voxel_rays(
@@ -166,7 +171,7 @@ def voxel_rays(
         )
     precise = cameras.to(torch.float64)
     _, direction = precise.cell_rays(feature_size, rays_per_cell)
-    grid = VoxelGrid(grid.resolution, grid.extent, grid.center.double().to(direction.device))
+    grid = VoxelGrid(grid.resolution, grid.extent, grid.center.to(direction.device).double())
     direction = (direction / grid.voxel_size).flatten(-4, -2)
     direction = direction.masked_fill_(direction.abs() < _PARALLEL, 0.0)
     in_picture = precise.cells_in_picture(feature_size, rays_per_cell)

@@ -14,17 +14,19 @@ CUDNN_FAULTY = range(90800, 91500)
 
 
 def choose_device(name: str) -> torch.device:
-    """Return the device called ``name``; ``auto`` is the first GPU if there is one, else the CPU.
+    """Return the device called ``name``; ``auto`` is a GPU of NVIDIA or AMD, else Apple's, else the CPU.
 
     Raises:
         ConfigError: there is no such device.
     """
     if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        if torch.cuda.is_available():
+            return torch.device("cuda")
+        return torch.device("mps" if torch.backends.mps.is_available() else "cpu")
     try:
         device = torch.device(name)
         torch.empty(0, device=device)
-    except (RuntimeError, AssertionError) as error:
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
         reason = str(error).splitlines()[0]
         if reason.startswith("Expected one of"):  # torch lists all it has ever known
             reason = "there is none of that name; a GPU is cuda, or cuda:1"

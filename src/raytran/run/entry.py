@@ -92,6 +92,7 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
     register_sweep_resolver()
     let_help_be_lazy()
     _let_threads_sleep()
+    _let_apples_gpu_ask_the_cpu()
 
     def decorate(function: Callable[[DictConfig], Any]) -> Callable[[], Any]:
         typed = _TYPED_FULL_ERROR
@@ -116,6 +117,12 @@ def entry_point(config_name: str) -> Callable[[Callable[[DictConfig], Any]], Cal
         return functools.partial(_compose_or_exit, config_name, main(task), typed)
 
     return decorate
+
+
+def _let_apples_gpu_ask_the_cpu() -> None:
+    """Let operations that torch does not have for Apple's GPUs run on the CPU; before torch is imported."""
+    if sys.platform == "darwin":
+        os.environ.setdefault("PYTORCH_ENABLE_MPS_FALLBACK", "1")
 
 
 def _let_threads_sleep() -> None:
