@@ -139,6 +139,6 @@ def _attend(
     dtype = torch.promote_types(dtype, torch.float32)
     by_target, by_source = pairs.orders("voxels" if to_voxels else "pixels")
     place = place_with_double(query.device)
-    qkv = (part.to(place, dtype) for part in (query, key, value))
-    out, logsumexp = pair_attention(*qkv, by_target, by_source)
+    there = [part.to(place, dtype) for part in (query, key, value)]
+    out, logsumexp = pair_attention(there[0], there[1], there[2], by_target, by_source)
     return out.to(query.device, query.dtype), logsumexp.to(query.device), False
