@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import hydra
-from hydra._internal.utils import get_args_parser
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import (
@@ -35,7 +34,7 @@ from raytran.errors import ConfigError, DataError, RaytranError
 from raytran.run.closed_pipe import survive_closed_pipe
 from raytran.run.config_dir import config_dir
 from raytran.run.help_page import help_page
-from raytran.run.lazy_help import let_help_be_lazy
+from raytran.run.lazy_help import hydra_parser, let_help_be_lazy
 from raytran.run.path_settings import PATH_SETTINGS, check_run_folder, key_of_path, literal_paths, quoted
 from raytran.run.refused_run import remove_refused_run
 from raytran.run.setting_mistakes import (
@@ -186,7 +185,7 @@ def _options(words: Sequence[str]) -> Namespace:
     Raises:
         ConfigError: something is typed like an option, and is none.
     """
-    found, unknown = get_args_parser().parse_known_args(_options_first(words))
+    found, unknown = hydra_parser().parse_known_args(_options_first(words))
     if unknown:
         name = unknown[0].partition("=")[0]
         raise ConfigError(

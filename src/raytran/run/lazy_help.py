@@ -8,34 +8,28 @@ object which becomes text only when it is shown, and so no command of Hydra 1.3.
 from __future__ import annotations
 
 import argparse
-import functools
-from collections.abc import Callable
 from importlib import import_module
 from typing import Any
+
+from hydra._internal.utils import get_args_parser
 
 _CHECK = "_check_help"
 """The method of ``ArgumentParser`` that looks; there is none before Python 3.14."""
 
-Make = Callable[[], argparse.ArgumentParser]
-
 
 def let_help_be_lazy() -> None:
-    """Make Hydra's parser without the look at its help; done once, and nothing before Python 3.14."""
+    """Let Hydra's commands make their parser by ``hydra_parser``."""
     main: Any = import_module("hydra.main")  # hydra.main itself is a function
-    if hasattr(argparse.ArgumentParser, _CHECK) and not hasattr(main.get_args_parser, "__wrapped__"):
-        main.get_args_parser = without_look(main.get_args_parser)
+    main.get_args_parser = hydra_parser
 
 
-def without_look(make: Make) -> Make:
-    """Return ``make``, during which argparse adds options without looking at their help."""
-
-    @functools.wraps(make)
-    def make_parser() -> argparse.ArgumentParser:
-        look = getattr(argparse.ArgumentParser, _CHECK)
-        setattr(argparse.ArgumentParser, _CHECK, lambda *_: None)
-        try:
-            return make()
-        finally:
-            setattr(argparse.ArgumentParser, _CHECK, look)
-
-    return make_parser
+def hydra_parser() -> argparse.ArgumentParser:
+    """Return the parser of Hydra's options, made without argparse's look at their help."""
+    look = getattr(argparse.ArgumentParser, _CHECK, None)
+    if look is None:
+        return get_args_parser()
+    setattr(argparse.ArgumentParser, _CHECK, lambda *_: None)
+    try:
+        return get_args_parser()
+    finally:
+        setattr(argparse.ArgumentParser, _CHECK, look)
