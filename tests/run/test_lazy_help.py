@@ -5,8 +5,9 @@ import argparse
 from importlib import import_module
 
 import pytest
-from hydra._internal.utils import get_args_parser
+from hydra._internal import utils
 
+from raytran.run.lazy_help import get_args_parser as of_hydra
 from raytran.run.lazy_help import hydra_parser, let_help_be_lazy
 
 
@@ -32,12 +33,14 @@ def looking(monkeypatch):
 
 def test_hydra_makes_its_command_line_where_argparse_looks(looking, monkeypatch):
     main = import_module("hydra.main")
-    monkeypatch.setattr(main, "get_args_parser", get_args_parser)
-    with pytest.raises(TypeError, match="LazyCompletionHelp"):
-        main.get_args_parser()
+    for module in (main, utils):
+        monkeypatch.setattr(module, "get_args_parser", of_hydra)
+        with pytest.raises(TypeError, match="LazyCompletionHelp"):
+            module.get_args_parser()
     let_help_be_lazy()
     looking.clear()
     assert main.get_args_parser().parse_args(["--cfg", "job", "a=1"]).overrides == ["a=1"]
+    assert utils.get_args(["a=1"]).overrides == ["a=1"]  # what a shell completes goes this way
     assert looking == []
 
 

@@ -18,9 +18,10 @@ _CHECK = "_check_help"
 
 
 def let_help_be_lazy() -> None:
-    """Let Hydra's commands make their parser by ``hydra_parser``."""
-    main: Any = import_module("hydra.main")  # hydra.main itself is a function
-    main.get_args_parser = hydra_parser
+    """Let Hydra make its parser by ``hydra_parser``, for commands and for what a shell completes."""
+    for name in ("hydra.main", "hydra._internal.utils"):
+        module: Any = import_module(name)  # hydra.main by itself is a function
+        module.get_args_parser = hydra_parser
 
 
 def hydra_parser() -> argparse.ArgumentParser:
