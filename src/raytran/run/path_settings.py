@@ -45,6 +45,7 @@ PATH_SETTINGS = {
         *("captures", "boxes", "arkitscenes"),
     ),
     "export_model": ("checkpoint", "output", "calibration"),
+    "poses": ("video", "output"),
     "plan": ("scene", "model.backbone.encoder.weights"),
     "view": ("folder",),
     "demo": ("output",),
@@ -54,6 +55,7 @@ PATH_SETTINGS = {
 _TYPED_ALONE = {
     "predict": "scene",
     "view": "folder",
+    "poses": "video",
     "plan": "scene",
     "demo": "output",
     "prepare": "check",
