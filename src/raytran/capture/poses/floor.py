@@ -21,6 +21,9 @@ _FEWEST = 15
 _LEAST_SHARE = 0.03
 """Least number, and least share, of the points below the cameras that lie on a floor."""
 
+_CONTRAST = 2.0
+"""How much denser a floor is than the median layer of points, which is of walls and furniture."""
+
 _LEAST_SPREAD = 0.3
 """Least spread of the floor's points in the plan, in parts of that of all points below the cameras: a seat is
 a layer too, but a small one."""
@@ -71,12 +74,14 @@ def find_floor(points: NDArray[np.float64], cameras: NDArray[np.float64]) -> Flo
     counts = np.bincount((depth / step).astype(int))
     density = ndimage.gaussian_filter1d(np.pad(counts, 4).astype(np.float64), 2.0)
     is_peak = (density[1:-1] > density[:-2]) & (density[1:-1] >= density[2:])
+    usual = float(np.median(density[4 : 5 + int(deepest / step)]))
     for peak in np.nonzero(is_peak)[0][::-1]:
         middle = (peak + 1 - 4 + 0.5) * step
         if middle < _DEEPEST * deepest:
             return None
         layer = np.abs(depth - middle) < 2 * half
-        enough = layer.sum() >= max(_FEWEST, _LEAST_SHARE * len(below))
+        stands_out = density[peak + 1] > _CONTRAST * usual
+        enough = stands_out and layer.sum() >= max(_FEWEST, _LEAST_SHARE * len(below))
         if enough and _spread(below[layer]) > _LEAST_SPREAD * _spread(below):
             near = np.abs(depth - np.median(depth[layer])) < 2 * half
             return Floor(top - float(np.median(depth[near])), int(near.sum()))
@@ -84,9 +89,9 @@ def find_floor(points: NDArray[np.float64], cameras: NDArray[np.float64]) -> Flo
 
 
 def _spread(points: NDArray[np.float64]) -> float:
-    """Return the root mean square distance in the plan from the median."""
+    """Return how far most points lie from their median in the plan."""
     plan = points[:, :2] - np.median(points[:, :2], axis=0)
-    return float(np.sqrt((np.quantile(np.abs(plan), 0.8, axis=0) ** 2).sum()))
+    return float(np.linalg.norm(np.quantile(np.abs(plan), 0.6, axis=0)))
 
 
 def level_by_floor(

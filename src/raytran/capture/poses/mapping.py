@@ -131,7 +131,7 @@ def find_cameras(
         ConfigError: pycolmap is not installed.
         DataError: fewer than ``FEWEST`` frames can be registered together; the sentence has the reason.
     """
-    pycolmap = load_pycolmap()
+    pycolmap = load_pycolmap("cameras are found")
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     work.mkdir(parents=True, exist_ok=True)
     tell = progress or (lambda what, done, total: None)
@@ -187,6 +187,7 @@ class _Database:
             return {
                 image.name: int(database.num_keypoints_for_image(image.image_id))
                 for image in database.read_all_images()
+                if database.exists_keypoints(image.image_id)
             }
 
     def matched_pairs(self) -> dict[tuple[str, str], tuple[int, str]]:
@@ -204,15 +205,20 @@ class _Database:
 
 def _extract(pycolmap: Any, database: _Database, images: Path, names: list[str], tell: Progress) -> None:
     """Find the features of the images that have none yet."""
+    reader = pycolmap.ImageReaderOptions(camera_model=CAMERA_MODEL, default_focal_length_factor=_FOCAL_FACTOR)
+    with database.opened() as opened:
+        is_new = opened.num_images() == 0
+    if is_new:
+        # Threads find features in any order: images get their numbers before that, in the film's order.
+        mode = pycolmap.CameraMode.SINGLE
+        pycolmap.import_images(database.path, images, mode, image_names=names, options=reader)
+    reader.existing_camera_id = 1
     found = database.num_features()
     missing = [name for name in names if name not in found]
-    reader = pycolmap.ImageReaderOptions(camera_model=CAMERA_MODEL, default_focal_length_factor=_FOCAL_FACTOR)
     options = pycolmap.FeatureExtractionOptions()
     options.sift.max_num_features = _MAX_FEATURES
     for start in range(0, len(missing), _BATCH):
         tell("finding features", len(names) - len(missing) + start, len(names))
-        if found or start:
-            reader.existing_camera_id = 1
         work = partial(
             pycolmap.extract_features,
             database.path,

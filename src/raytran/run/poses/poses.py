@@ -33,6 +33,9 @@ from raytran.run.train.build import plain
 
 _log = logging.getLogger(__name__)
 
+SCANS = Path("outputs") / "scans"
+"""Where scans go if nothing else is said, each by the name of its film."""
+
 SUPPOSED_HEIGHT = 1.5
 """Metres above the floor at which a phone is held, where nobody says: before the face of who films."""
 
@@ -54,13 +57,15 @@ def poses(cfg: DictConfig) -> Path:
     """
     settings = plain(cfg)
     _check(settings)
-    load_pycolmap()
-    output = Path(settings["output"]).resolve()
+    load_pycolmap("the cameras of a film are found")
+    video = Path(settings["video"]).resolve()
+    typed = Path(settings["output"]) if settings["output"] else SCANS / video.stem
+    output = typed.resolve()
 
     def taken(who: str) -> ConfigError:
         return ConfigError(f"another process writes {output} ({who}): wait for it, or give another output=")
 
-    with closing(open_film(Path(settings["video"]).resolve())) as film:
+    with closing(open_film(video)) as film:
         if not (output / _WORK / _RECORD).is_file() and output.is_dir() and any(output.iterdir()):
             raise ConfigError(
                 f"output={output} holds something else: choose a folder that does not exist yet"
@@ -68,7 +73,9 @@ def poses(cfg: DictConfig) -> Path:
         (output / _WORK).mkdir(parents=True, exist_ok=True)
         with exclusive_lock(output / _WORK / ".lock", if_taken=taken):
             _begin(film, settings, output / _WORK / _RECORD)
-            return _find(film, settings, output)
+            _find(film, settings, output)
+    _log.info("next: raytran predict %s", shlex.quote(str(typed)))
+    return output
 
 
 def _check(settings: dict[str, Any]) -> None:
@@ -116,7 +123,7 @@ def _begin(film: Film, settings: dict[str, Any], path: Path) -> None:
         )
 
 
-def _find(film: Film, settings: dict[str, Any], output: Path) -> Path:
+def _find(film: Film, settings: dict[str, Any], output: Path) -> None:
     """Choose frames, find their cameras, and write the scan."""
     with _bars() as bars:
         names = _chosen(film, settings, output, bars)
@@ -146,8 +153,6 @@ def _find(film: Film, settings: dict[str, Any], output: Path) -> Path:
         "" if floor is None else f", {float(heights.mean()) - scale * floor.height:.2f} m above the floor",
     )
     _log.info("wrote %s and %s of %d frames", output / LISTED, IMAGES, len(found.names))
-    _log.info("next: raytran predict %s", shlex.quote(str(settings["output"])))
-    return output
 
 
 def _chosen(film: Film, settings: dict[str, Any], output: Path, bars: _Bars) -> list[str]:
