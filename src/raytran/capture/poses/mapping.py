@@ -148,7 +148,7 @@ def find_cameras(
             _match(pycolmap, database, pairs_to_match(names, kind), work / "pairs.txt", tell)
             _map(pycolmap, database, images, models, len(names), tell)
         now = _largest(pycolmap, models, names)
-        if found is None or len(now.names) > len(found.names):
+        if found is None or len(now.names) >= len(found.names):
             found = now
     if found is None or len(found.names) < FEWEST:
         raise _too_few(database, 0 if found is None else len(found.names), names)
