@@ -93,6 +93,14 @@ def test_a_damaged_database_is_told(room, tmp_path):
         find_cameras(tmp_path / "images", names, tmp_path / "work")
 
 
+def test_a_damaged_model_is_told(room, tmp_path):
+    names = drawn(room, room.walk(12, turn=np.pi), tmp_path / "images")
+    find_cameras(tmp_path / "images", names, tmp_path / "work")
+    (tmp_path / "work" / "models" / "sequential" / "0" / "cameras.bin").write_bytes(b"")
+    with pytest.raises(DataError, match=r"sequential is damaged .*: delete it, then give the command again"):
+        find_cameras(tmp_path / "images", names, tmp_path / "work")
+
+
 def test_which_pairs_are_compared():
     names = [str(number) for number in range(40)]
     near = pairs_to_match(names, "sequential")

@@ -5,10 +5,13 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
+import sys
 
 import numpy as np
 import pytest
 
+from raytran.capture.lens import load_pycolmap
 from raytran.capture.open import open_scene
 from raytran.errors import ConfigError, DataError
 from raytran.run.entry import compose
@@ -57,6 +60,8 @@ def test_the_scan_opens_upright_and_in_metres(film, scan, room, caplog):
     fitted, scale = aligned(found, true)
     assert np.linalg.norm(fitted[:, :3, 3] - true[:, :3, 3], axis=1).max() < 0.05
     assert scale == pytest.approx(1.0, abs=0.04)
+    # The floor is at 0, where the room has it.
+    assert found[:, 2, 3].mean() == pytest.approx(CAMERA_HEIGHT, abs=0.01)
     # Up: what turns found cameras into true ones is a turn about +z.
     turn = fitted[0, :3, :3] @ found[0, :3, :3].T
     assert np.degrees(np.arccos(turn[2, 2])) < 1.5
@@ -119,6 +124,24 @@ def test_settings_that_make_no_sense(film, tmp_path, words, message):
     with pytest.raises(ConfigError, match=message):
         poses(compose("poses", [f"video={film}", f"output={tmp_path / 'out'}", *words]))
     assert not (tmp_path / "out").exists()
+
+
+def test_pycolmap_is_asked_for(film, tmp_path, monkeypatch):
+    load_pycolmap.cache_clear()
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    with pytest.raises(ConfigError, match=r"cameras of a film are found by pycolmap, .*'raytran\[colmap\]'"):
+        poses(compose("poses", [f"video={film}", f"output={tmp_path / 'out'}"]))
+    load_pycolmap.cache_clear()
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("content", ["{}", '{"frames": [0, 1.5]}', '{"frames": [0, 99]}', "{"])
+def test_a_damaged_list_of_frames(film, scan, tmp_path, content):
+    (tmp_path / "out" / "work").mkdir(parents=True)
+    shutil.copy(scan / "work" / "film.json", tmp_path / "out" / "work")
+    (tmp_path / "out" / "work" / "frames.json").write_text(content)
+    with pytest.raises(DataError, match=r"frames\.json"):
+        poses(compose("poses", [f"video={film}", f"output={tmp_path / 'out'}"]))
 
 
 def test_folders_that_are_of_something_else(film, scan, tmp_path):

@@ -21,8 +21,9 @@ _FEWEST = 15
 _LEAST_SHARE = 0.03
 """Least number, and least share, of the points below the cameras that lie on a floor."""
 
-_CONTRAST = 1.3
-"""How much denser the floor is than the layers just above it, which are of walls and furniture."""
+_ONSET, _GOES_ON = 3.0, 0.7
+"""How much denser the floor is, at least, than the layer below it and than that above: the room begins there.
+What a camera does not see for looking too little down thins out; it begins nowhere so at once."""
 
 _MOST_DEEPER = 0.1
 """Largest share of the points below the cameras that lie deeper than the floor, wrongly matched."""
@@ -52,7 +53,7 @@ class Floor:
 
 
 def find_floor(points: NDArray[np.float64], cameras: NDArray[np.float64]) -> Floor | None:
-    """Find the floor: the lowest layer of points that is wide, and denser than those just above it.
+    """Find the floor: the lowest layer of points that is wide and begins at once.
 
     Args:
         points: ``(p, 3)`` in a world whose +z is up, any unit.
@@ -73,8 +74,9 @@ def find_floor(points: NDArray[np.float64], cameras: NDArray[np.float64]) -> Flo
         if (depth > middle + 2 * half).mean() > _MOST_DEEPER:
             return None
         chosen = np.abs(depth - middle) < 2 * half
-        above = float(((depth < middle - 2 * half) & (depth > middle - 10 * half)).sum()) / 2
-        is_dense = chosen.sum() > _CONTRAST * above + 2 * np.sqrt(above)
+        above = ((depth < middle - 2 * half) & (depth > middle - 6 * half)).sum()
+        under = ((depth > middle + 2 * half) & (depth < middle + 6 * half)).sum()
+        is_dense = chosen.sum() > _ONSET * under and chosen.sum() > _GOES_ON * above
         if (
             is_dense
             and chosen.sum() >= max(_FEWEST, _LEAST_SHARE * len(below))
@@ -89,8 +91,9 @@ def _density(depth: NDArray[np.float64], half: float) -> tuple[NDArray[np.float6
     """Return depths, half of ``half`` apart, and how many points are near each, smoothed over a layer."""
     step = half / 2
     counts = np.pad(np.bincount((depth / step).astype(int)), 4)
-    middles = (np.arange(len(counts)) - 4 + 0.5) * step
-    return middles, ndimage.gaussian_filter1d(counts.astype(np.float64), 2.0)
+    middles = (np.arange(len(counts), dtype=np.float64) - 3.5) * step
+    density: NDArray[np.float64] = ndimage.gaussian_filter1d(counts.astype(np.float64), 2.0)
+    return middles, density
 
 
 def _spread(points: NDArray[np.float64]) -> float:

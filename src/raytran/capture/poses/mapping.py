@@ -326,8 +326,17 @@ def _first_line(error: Exception) -> str:
 
 
 def _largest(pycolmap: Any, folder: Path, names: list[str]) -> FoundCameras:
-    """Return the largest of the models in a folder; it has no frames if there is none."""
-    models = [pycolmap.Reconstruction(part) for part in sorted(folder.iterdir()) if part.is_dir()]
+    """Return the largest of the models in a folder; it has no frames if there is none.
+
+    Raises:
+        DataError: one is damaged.
+    """
+    try:
+        models = [pycolmap.Reconstruction(part) for part in sorted(folder.iterdir()) if part.is_dir()]
+    except (RuntimeError, ValueError) as error:
+        raise DataError(
+            f"{folder} is damaged ({_first_line(error)}): delete it, then give the command again"
+        ) from error
     if not models:
         nothing = np.zeros((0, 4, 4))
         return FoundCameras((), nothing, (1, 1), 1.0, (0, 0), 0.0, np.zeros((0, 3)), len(names), 0, 0.0)

@@ -86,7 +86,7 @@ def write_scene(
     Args:
         folder: with ``images/``.
         found: the cameras.
-        world_from_model: ``(4, 4)`` rotation and scale, for up and metres.
+        world_from_model: ``(4, 4)`` rotation, scale and shift, for up, metres and the floor at 0.
         is_level: whether +z is up in this world for certain.
         is_metric: whether its unit is the metre for certain.
         made_from: what to remember beside, values that JSON can hold.

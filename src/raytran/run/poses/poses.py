@@ -137,6 +137,8 @@ def _find(film: Film, settings: dict[str, Any], output: Path) -> None:
     scale, how, is_metric = _unit(settings, found, floor, cameras)
     world_from_model = np.eye(4)
     world_from_model[:3, :3] = scale * turn
+    if floor is not None:
+        world_from_model[2, 3] = -scale * floor.height
     write_scene(
         output,
         found,
@@ -160,7 +162,8 @@ def _chosen(film: Film, settings: dict[str, Any], output: Path, bars: _Bars) -> 
     path = output / _WORK / _CHOSEN
     if path.is_file():
         frames = read_json_object(path).get("frames")
-        if not isinstance(frames, list) or not all(frame in range(len(film)) for frame in frames):
+        known = range(len(film))
+        if not isinstance(frames, list) or not all(type(frame) is int and frame in known for frame in frames):
             raise DataError(f"{path} is damaged: delete {output / _WORK} and give the command again")
     else:
         choice = choose_sharp(film, settings["frames"], progress=bars.track("looking for sharp frames"))
