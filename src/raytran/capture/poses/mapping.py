@@ -281,7 +281,8 @@ def _map(pycolmap: Any, database: _Database, images: Path, model: Path, count: i
         registered[0] = min(count, registered[0] + 1)
 
     with finished_folder(model) as folder:
-        options = pycolmap.IncrementalPipelineOptions(random_seed=_SEED, extract_colors=False)
+        # Several threads add up in any order, and a last bit decides which points are kept.
+        options = pycolmap.IncrementalPipelineOptions(random_seed=_SEED, num_threads=1, extract_colors=False)
         work = partial(
             pycolmap.incremental_mapping,
             database.path,
