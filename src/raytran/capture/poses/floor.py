@@ -108,7 +108,7 @@ def level_by_floor(
     """Return the direction, up to some degrees from up by the cameras, in which the floor is flattest.
 
     Hand-held cameras tell up roughly. Of films of five generated rooms and a real one they were off by 1.3 to
-    4.8°, in the median by 2.0°, and the floor by 0.1 to 2.4°, in the median by 0.8°.
+    2.4°, in the median by 2.0°, and the floor by 0.1 to 1.9°, in the median by 0.8°.
 
     Args:
         up: ``(3,)`` by the cameras, of length one.
