@@ -31,7 +31,19 @@ COLUMNS: tuple[dict[str, str], ...] = (
     {"export": "GLB, OBJ, CSV,\nprograms", "training": "Lightning:\nstages, callbacks"},
     {"run": "configs →\nobjects"},
     dict.fromkeys(
-        ("train", "curriculum", "evaluate", "predict", "prepare", "plan", "demo", "view", "export_model"), ""
+        (
+            "train",
+            "curriculum",
+            "evaluate",
+            "predict",
+            "prepare",
+            "plan",
+            "demo",
+            "view",
+            "poses",
+            "export_model",
+        ),
+        "",
     ),
 )
 """Folders and files from left to right, each with what it holds; the last column are the commands."""

@@ -263,6 +263,7 @@ def settings_of_all_commands(project_root):
         "export_model": [[]],
         "view": [[]],
         "demo": [[]],
+        "poses": [[]],
         "plan": [[]],
     }
     chosen |= {"evaluate": [[]], "curriculum": [[]]}

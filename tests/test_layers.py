@@ -33,6 +33,7 @@ LAYERS: list[set[str]] = [
         "plan",
         "demo",
         "view",
+        "poses",
         "export_model",
         "__main__",
     },

@@ -16,6 +16,7 @@ from raytran.run.closed_pipe import survive_closed_pipe
 VERBS = {
     "demo": "the whole path on generated rooms in minutes: train, measure, predict, one page to look at",
     "predict": "the objects of a scene, with class, pose and mesh, from a posed video",
+    "poses": "the cameras of a video whose poses are not known, for predict",
     "view": "look at a prediction in the browser",
     "prepare": "make a data set, or look through one for mistakes",
     "train": "train one stage",
@@ -27,13 +28,14 @@ VERBS = {
 """Every command, in the order in which most people come to them, and what it is for."""
 
 _EXAMPLES = (
-    ("raytran predict walk.mp4", "a folder, a recording or a video"),
+    ("raytran predict sample", "a room that raytran carries; or a folder, a recording, a video"),
     ("raytran train experiment=stage2 preset=tiny", "settings are key=value"),
     ("raytran VERB --help", "all settings of a command"),
 )
 _ELSEWHERE = {
     **dict.fromkeys(("test", "val", "validate", "score"), "evaluate"),
     **dict.fromkeys(("infer", "inference", "detect", "run"), "predict"),
+    **dict.fromkeys(("process-data", "sfm", "colmap", "mapper"), "poses"),
     **dict.fromkeys(("show", "viewer", "open"), "view"),
     **dict.fromkeys(("check", "data", "doctor"), "prepare"),
     **dict.fromkeys(("fit", "finetune"), "train"),

@@ -157,7 +157,7 @@ class RayTran(nn.Module):
         voxels, pixels = self._run_backbone(views, traced, "foreground" in tasks, views_at_once)
         objects = ObjectOutputs(())
         if "objects" in tasks:
-            objects = self._find_objects(voxels, self._grid(traced.grid_center), true_objects)
+            objects = self.find_objects(voxels, self._grid(traced.grid_center), true_objects)
         return RawScene(
             grid_center=traced.grid_center,
             occupancy=self.heads["occupancy"](voxels) if "occupancy" in tasks else None,
@@ -169,10 +169,16 @@ class RayTran(nn.Module):
             voxels=voxels,
         )
 
-    def _find_objects(
-        self, voxels: Tensor, grid: VoxelGrid, true_objects: Sequence[ObjectSet] | None
+    def find_objects(
+        self, voxels: Tensor, grid: VoxelGrid, true_objects: Sequence[ObjectSet] | None = None
     ) -> ObjectOutputs:
-        """Run the object head, and read the voxels in its boxes for a shape head that asks for them."""
+        """Run the object head, and read the voxels in its boxes for a shape head that asks for them.
+
+        Args:
+            voxels: ``(B, X, Y, Z, C)`` features.
+            grid: of the voxels, ``center`` ``(B, 3)``.
+            true_objects: as in ``forward``.
+        """
         objects: ObjectOutputs = self.heads["objects"](voxels, grid, true_objects)
         if "shape" not in self.heads:
             return objects
@@ -263,7 +269,7 @@ class RayTran(nn.Module):
         return self.heads["view"](voxels, cameras, self._grid(traced.grid_center), traced.new_pairs)
 
     def decode_shapes(self, embedding: Tensor) -> Tensor:
-        """Return shape logits ``(M, S, S, S)`` of query embeddings ``(M, C)``."""
+        """Return shape logits ``(M, S, S, S)`` of query embeddings ``(M, C)``, as ``RawObjects`` has them."""
         return self.heads["shape"](embedding)
 
     def class_layers(self) -> tuple[str, ...]:

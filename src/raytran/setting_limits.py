@@ -38,6 +38,7 @@ _COUNTS: dict[str, tuple[int, int]] = {
     ),
     **dict.fromkeys(("frames", "max_frames"), (1, MAX_VIEWS)),
     **dict.fromkeys(("new_views", "num_new_views", "num_overlays"), (0, MAX_VIEWS)),
+    "longest_side": (64, MAX_SIDE),
     "turntable": (0, 1000),
     # the network
     **dict.fromkeys(("grid_resolution", "resolution"), (1, MAX_CELLS_A_SIDE)),
@@ -76,6 +77,7 @@ _NUMBERS: dict[str, Quantity] = {
     "room_size": Quantity("a length in metres", 1, 1000),
     "norm_momentum": SHARE,
     "scale": SCALE,
+    **dict.fromkeys(("camera_height", "distance"), Quantity("a length in metres", 0, 1000)),
     "ceilings": _POSITIVE,
     **dict.fromkeys(("learning_rate", "weight_decay", "gradient_clip", "gradient_clip_val"), _FACTOR),
     **dict.fromkeys(("score_threshold", "duplicate_iou", "mirror", "frame_dropout"), SHARE),

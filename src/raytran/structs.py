@@ -405,7 +405,8 @@ class RawObjects(TensorStruct):
         center: ``(B, Q, 3)`` box centre in the world, metres.
         log_size: ``(B, Q, 3)`` natural logarithm of the sizes in metres.
         yaw_vector: ``(B, Q, 2)`` (sin, cos) of the yaw, not normalised.
-        embedding: ``(B, Q, C)`` query embedding, from which shapes are decoded.
+        embedding: ``(B, Q, C)`` query embedding, from which shapes are decoded; for a shape head that reads
+            boxes (``BoxVoxelShapeHead``) with what it reads there behind it.
     """
 
     class_logits: Tensor

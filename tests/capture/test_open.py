@@ -112,7 +112,7 @@ def test_what_is_not_there_or_unknown(walk, tmp_path):
     for name in ("9" * 300, "9" * 300 + ".zip"):
         with pytest.raises(DataError, match="there is no scene"):
             open_scene(tmp_path / name)
-    with pytest.raises(DataError, match="has images without poses: let COLMAP or a phone's ARKit find them"):
+    with pytest.raises(DataError, match="has images without poses: raytran poses finds them"):
         open_scene(walk.folder)
     (tmp_path / "0.JPG").touch()
     with pytest.raises(DataError, match=r"0\.JPG is one image: give the folder with all frames"):
@@ -130,7 +130,7 @@ def test_what_is_not_there_or_unknown(walk, tmp_path):
             ["notes.md"],
             r"holds 1 files \.md, and no scene: read are ScanNet, 7-Scenes, transforms\.json, COLMAP",
         ),
-        (["images/0.jpg"], "has images without poses: let COLMAP or a phone's ARKit find them"),
+        (["images/0.jpg"], "has images without poses: raytran poses finds them"),
         (["0.WEBP", "1.webp"], "has images without poses"),
         (["trajectory.txt"], r"has poses in trajectory\.txt but no images: put them in its folder rgb"),
         (["metadata.json"], "has Record3D's metadata but no folder rgb/ or rgbd/"),

@@ -140,7 +140,7 @@ def test_frames_that_claim_to_be_huge_are_refused(video, monkeypatch):
 
 def test_without_pyav_it_is_said_what_to_install(video, monkeypatch):
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(ConfigError, match="PyAV, which is not installed: pip install av"):
+    with pytest.raises(ConfigError, match=r"PyAV, which is not installed: pip install 'raytran\[video\]'"):
         read_video(video)
 
 

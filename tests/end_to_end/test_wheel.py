@@ -52,6 +52,7 @@ def test_the_wheel_is_what_runs(site: Path, tmp_path: Path) -> None:
         "predict",
         "prepare",
         "demo",
+        "poses",
         "export_model",
         "view",
     ],

@@ -7,7 +7,9 @@ import math
 
 import torch
 
+from raytran.export.torch_program import example_inputs, export_network, export_shapes
 from raytran.extensions.box_voxels import CELLS, BoxVoxelShapeHead, box_points, read_voxels
+from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.structs import RawObjects
 
@@ -66,6 +68,17 @@ def test_a_head_reads_query_and_box_of_its_own_object_without_gradient() -> None
     assert not torch.equal(after[1], before[1])
     before.sum().backward()
     assert all(p.grad is not None for p in head.parameters())
+
+
+def test_its_programs_go_together() -> None:
+    model = make_model().eval()
+    model.heads["shape"] = BoxVoxelShapeHead(channels=CHANNELS, widths=(8, 8, 4, 4)).eval()
+    cameras = Cameras.of(make_views(views=3).scene())
+    inputs = example_inputs(model, cameras)
+    outputs = export_network(model, cameras, tasks=("objects",)).module()(*inputs)
+    decoded = export_shapes(model).module()(outputs["embedding"])
+    torch.testing.assert_close(decoded, model.decode_shapes(outputs["embedding"]), atol=1e-4, rtol=1e-4)
+    assert decoded.shape == (5, 63, 63, 63)
 
 
 def test_the_network_decodes_shapes_from_boxes_in_every_pass() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from raytran.errors import ConfigError
 from raytran.rooms import ensure as rooms
-from raytran.rooms.ensure import ensure_rooms, ensure_rooms_v1
+from raytran.rooms.ensure import ensure_rooms, ensure_rooms_v1, ensure_rooms_v2
 from raytran.run.entry import compose
 from raytran.run.train.build import build_data
 
@@ -17,7 +17,7 @@ from raytran.run.train.build import build_data
 def made(monkeypatch):
     """Record the calls of the generator instead of making rooms."""
     calls = []
-    for name in ("generate_rooms", "generate_rooms_v1"):
+    for name in ("generate_rooms", "generate_rooms_v1", "generate_rooms_v2"):
         monkeypatch.setattr(rooms, name, lambda output, **settings: calls.append(settings))
     return calls
 
@@ -95,6 +95,22 @@ def test_a_whole_benchmark_is_used_and_a_smaller_one_is_completed(tmp_path, made
     assert len(made) == 1
     ensure_rooms_v1(tmp_path, **(asked | {"num_test": 2}))
     assert made[1:] == [asked | {"num_test": 2, "processes": 0, "progress": True}]
+
+
+def test_whole_rooms_v2_are_used_and_fewer_are_completed(tmp_path, made):
+    write_set(tmp_path, ("a", "b"), present=("a", "b"))
+    ensure_rooms_v2(tmp_path, num_train=1, num_val=1)
+    assert not made
+    ensure_rooms_v2(tmp_path, num_train=2, num_val=1)
+    assert made == [{"num_train": 2, "num_val": 1, "cads": None, "processes": 0, "progress": True}]
+
+
+def test_rooms_v2_as_training_data(made, tmp_path):
+    typed = ["data=rooms-v2", f"data.root={tmp_path}", "data.make.num_train=7", "output_dir=x"]
+    with pytest.raises(ConfigError, match=r"rooms\.make=true makes 57 of them there"):
+        build_data(compose("train", typed)).prepare_data()
+    build_data(compose("train", [*typed, "rooms.make=true", "data.make.cads=furniture"])).prepare_data()
+    assert made == [{"num_train": 7, "num_val": 50, "cads": "furniture", "processes": 0, "progress": True}]
 
 
 def test_the_benchmark_as_training_data(made, tmp_path):

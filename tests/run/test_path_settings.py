@@ -274,6 +274,8 @@ def test_a_job_of_a_sweep_keeps_the_commas_of_a_path():
 )
 def test_lists_of_paths(typed, meant):
     assert list(compose("evaluate", [typed]).draw_with) == meant
+    more = compose("train", [typed.replace("draw_with", "data.more_roots"), "output_dir=unused"])
+    assert list(more.data.more_roots) == meant
 
 
 def test_the_folder_that_lightning_gives_to_a_rank():

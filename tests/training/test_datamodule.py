@@ -87,6 +87,34 @@ def test_training_draws_views_and_validation_spreads_them(monkeypatch, tmp_path)
     assert (validation["split"], validation["view_choice"], validation["num_views"]) == ("val", "even", 9)
 
 
+def test_further_roots_add_training_scenes_alone(monkeypatch, tmp_path):
+    data = make_data(monkeypatch, tmp_path, more_roots=[tmp_path / "a", tmp_path / "b"])
+    joined = data.split("train", training=True)
+    assert [part.options["root"].name for part in joined._datasets] == [tmp_path.name, "a", "b"]
+    assert len(joined) == 15
+    assert [joined[3, index] for index in (0, 4, 5, 9, 10, 14)] == [
+        *((3, 0), (3, 4)),
+        *((3, 0), (3, 4)),
+        *((3, 0), (3, 4)),
+    ]
+    assert [joined[index] for index in (4, 5)] == [4, 0]
+    with pytest.raises(IndexError, match="scene 15 of 15"):
+        joined[0, 15]
+    items = {item for batch in islice(data.train_dataloader(), 15) for item in batch}
+    assert items == {(0, index) for index in range(5)}  # each of the three sets gives all of its five
+    assert data.split("val").options["root"] == data.split("train").options["root"] == tmp_path
+
+
+def test_shapes_are_learned_where_one_of_the_roots_has_some(monkeypatch, tmp_path):
+    data = make_data(monkeypatch, tmp_path, more_roots=[tmp_path / "a"])
+    data._targets = ("shapes",)
+    data._dataset = lambda **options: (Boxes if options["root"] == tmp_path else Scenes)(**options)
+    assert data.train_dataloader() is not None
+    data._dataset = Boxes
+    with pytest.raises(DataError, match="only boxes are known"):
+        data.train_dataloader()
+
+
 def test_only_training_scenes_are_augmented(monkeypatch, tmp_path):
     data = make_data(monkeypatch, tmp_path, augmentation=Augmentation(mirror=1.0))
     assert data.split("train", training=True).options["augmentation"].mirror == 1

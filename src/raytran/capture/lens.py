@@ -399,8 +399,11 @@ def _unit_camera(model: str, distortion: tuple[float, ...]) -> Any:
 
 
 @cache
-def load_pycolmap() -> Any:
+def load_pycolmap(purpose: str = "lenses that distort are computed") -> Any:
     """Import pycolmap.
+
+    Args:
+        purpose: what is done by it, for the message if it is not there.
 
     Raises:
         ConfigError: it is not installed.
@@ -410,8 +413,7 @@ def load_pycolmap() -> Any:
         pycolmap = importlib.import_module("pycolmap")
     except ImportError as error:
         raise ConfigError(
-            "lenses that distort are computed by pycolmap, which is not installed: "
-            "pip install 'raytran[colmap]'"
+            f"{purpose} by pycolmap, which is not installed: pip install 'raytran[colmap]'"
         ) from error
     # Its import makes SIGTERM print a stack trace in place of what was to happen.
     if terminate is not None and threading.current_thread() is threading.main_thread():

@@ -50,6 +50,9 @@ _SCANNETPP = {
 _PLACES = (".", "nerfstudio", "dslr/nerfstudio", "iphone/nerfstudio")
 _PARTS_OF_PLACES = ("nerfstudio", "dslr", "iphone")
 
+WORLD, WORLD_UP, WORLD_METRES = "raytran_world", "+z", "metre"
+"""Key beside the list under which ``raytran poses`` says ``up`` and ``unit``; what they are if it is sure."""
+
 BAD = "marked as bad"
 """Reason why a frame is dropped: ScanNet++ marks blurred images with ``is_bad``."""
 
@@ -128,8 +131,16 @@ def read_nerfstudio(path: Path, intrinsics: Intrinsics | None = None) -> Recordi
         scene_id=_scene_name(listed),
         frames=collected.checked(),
         axes="opengl",
+        up=(0.0, 0.0, 1.0) if all(_says(entry, "up", WORLD_UP) for entry in entries) else None,
+        metric=all(_says(entry, "unit", WORLD_METRES) for entry in entries),
         dropped=collected.dropped,
     )
+
+
+def _says(entry: _Entry, key: str, value: str) -> bool:
+    """Whether the list of a frame promises something of its world."""
+    world = entry.content.get(WORLD)
+    return isinstance(world, dict) and world.get(key) == value
 
 
 @dataclass(frozen=True)

@@ -213,7 +213,7 @@ def _unknown(path: Path) -> DataError:
         return DataError(f"{path} is no scene but holds some: give one of {names}{more}")
     if find_images(path):
         return DataError(
-            f"{path} has images without poses: let COLMAP or a phone's ARKit find them, or write "
+            f"{path} has images without poses: raytran poses finds them, or write "
             f"trajectory.txt and intrinsics.txt beside them ({page('own-data.md')})"
         )
     return DataError(f"{path} holds {listing.summary(most=2)}, and no scene: read are {_READ}")

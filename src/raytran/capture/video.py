@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import shlex
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -370,9 +371,11 @@ def _beside(video: Path, names: tuple[str, ...], what: str) -> Path:
     path = next((video.with_name(name) for name in names if video.with_name(name).is_file()), None)
     if path is None:
         form = "`timestamp tx ty tz qx qy qz qw` lines" if what == "pose track" else "`fx fy cx cy`"
-        typed = "" if what == "pose track" else ", or give intrinsics=fx,fy,cx,cy"
+        other = ", or give intrinsics=fx,fy,cx,cy"
+        if what == "pose track":
+            other = f", or let raytran poses {shlex.quote(video.name)} find them"
         raise DataError(
-            f"{video} has no {what} beside it: write {form} to {video.with_name(names[0]).name}{typed}"
+            f"{video} has no {what} beside it: write {form} to {video.with_name(names[0]).name}{other}"
         )
     return path
 
@@ -381,4 +384,6 @@ def _pyav() -> Any:
     try:
         return importlib.import_module("av")
     except ImportError as error:
-        raise ConfigError("videos are read by PyAV, which is not installed: pip install av") from error
+        raise ConfigError(
+            "videos are read by PyAV, which is not installed: pip install 'raytran[video]'"
+        ) from error

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -327,6 +329,34 @@ def scan2cad_dataset(root: Path, split: str, *, cache_dir: Path, **options: Any)
         cache_dir=cache_dir,
         **options,
     )
+
+
+class JoinedScenes(Dataset[SceneBatch]):
+    """The scenes of several data sets one after the other, each as its own data set gives it.
+
+    Args:
+        datasets: the data sets, of which each takes what ``SceneDataset`` takes.
+    """
+
+    def __init__(self, datasets: Sequence[Dataset[SceneBatch]]) -> None:
+        self._datasets = tuple(datasets)
+        self._ends = tuple(accumulate(len(dataset) for dataset in datasets))  # type: ignore[arg-type]
+
+    def __len__(self) -> int:
+        return self._ends[-1]
+
+    def __getitem__(self, item: int | tuple[int, int]) -> SceneBatch:
+        """Return a scene with B = 1; ``item`` is its index or (epoch, index)."""
+        index = item[1] if isinstance(item, tuple) else item
+        if not 0 <= index < len(self):
+            raise IndexError(f"scene {index} of {len(self)}")
+        number = bisect_right(self._ends, index)
+        index -= self._ends[number - 1] if number else 0
+        return self._datasets[number][(item[0], index) if isinstance(item, tuple) else index]
+
+    def has_shapes(self) -> bool:
+        """Return whether an object of any of the data sets has a known shape."""
+        return any(getattr(dataset, "has_shapes", lambda: True)() for dataset in self._datasets)
 
 
 class FewScenes(Dataset[SceneBatch]):

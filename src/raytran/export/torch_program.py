@@ -100,7 +100,7 @@ class NetworkProgram(nn.Module):
         if pixels is not None:
             outputs["foreground"] = heads["foreground"](pixels[0])[0]
         if "objects" in self.tasks:
-            last = heads["objects"](voxels, grid).layers[-1]
+            last = self.model.find_objects(voxels, grid).layers[-1]
             of_queries = ("class_logits", "center", "log_size", "yaw_vector", "embedding")
             outputs |= {name: getattr(last, name)[0] for name in of_queries}
         return outputs

@@ -70,12 +70,11 @@ def generate_rooms_v1(
     """
     output = Path(output)
     asked = {"train": num_train, "val": num_val, "test": num_test}
-    check_numbers(asked, _NUMBERS)
-    counts = {name: max(count, listed_count(output, name)) for name, count in asked.items()}
+    numbers = scan_numbers(output, asked, _NUMBERS)
     splits = (
-        RoomSplit("train", _NUMBERS["train"][: counts["train"]], SETTINGS.frames),
-        RoomSplit("val", _NUMBERS["val"][: counts["val"]], SETTINGS.frames, _models(1), textures=1),
-        RoomSplit("test", _NUMBERS["test"][: counts["test"]], TEST_FRAMES, _models(2), textures=2),
+        RoomSplit("train", numbers["train"], SETTINGS.frames),
+        RoomSplit("val", numbers["val"], SETTINGS.frames, _models(1), textures=1),
+        RoomSplit("test", numbers["test"], TEST_FRAMES, _models(2), textures=2),
     )
     claim = {"format": FORMAT, **asdict(SETTINGS), "test_frames": TEST_FRAMES}
     return make_splits(output, SETTINGS, splits, claim=claim, processes=processes, progress=progress)
@@ -111,9 +110,10 @@ def generate_rooms_v1_furniture(
     """
     if part not in FURNITURE_PARTS:
         raise ConfigError(f"unknown part={part}: choose one of {', '.join(FURNITURE_PARTS)}")
-    check_numbers({"test": num_test}, {"test": _FURNITURE_NUMBERS})
-    numbers = _FURNITURE_NUMBERS[: max(num_test, listed_count(Path(output), "test"))]
-    split = RoomSplit("test", numbers, TEST_FRAMES, _models(2), textures=2, given=FURNITURE_PARTS[part])
+    numbers = scan_numbers(Path(output), {"test": num_test}, {"test": _FURNITURE_NUMBERS})
+    split = RoomSplit(
+        "test", numbers["test"], TEST_FRAMES, _models(2), textures=2, given=FURNITURE_PARTS[part]
+    )
     claim = {"format": FORMAT, "furniture": True, **asdict(SETTINGS), "test_frames": TEST_FRAMES}
     if part != "all":  # rooms made before there were parts go on as they are
         claim |= {"part": part}
@@ -127,14 +127,13 @@ def _models(split: int) -> range:
     return range(split * MODELS_PER_CLASS, (split + 1) * MODELS_PER_CLASS)
 
 
-def listed_count(output: Path, split: str) -> int:
-    """Return how many scans of a split were listed by an earlier call."""
-    path = output / "scannet" / f"scannetv2_{split}.txt"
-    return len(read_split(output / "scannet", split) or ()) if path.is_file() else 0
+def scan_numbers(output: Path, asked: dict[str, int], numbers: dict[str, range]) -> dict[str, range]:
+    """Return the numbers of each split's scans: the first ones, as many as asked or as are listed already.
 
-
-def check_numbers(asked: dict[str, int], numbers: dict[str, range]) -> None:
-    """Check numbers of rooms by split.
+    Args:
+        output: of the data set.
+        asked: how many, by split.
+        numbers: that the scans of a split can have.
 
     Raises:
         ConfigError: one is too large or negative, or all are 0.
@@ -146,3 +145,10 @@ def check_numbers(asked: dict[str, int], numbers: dict[str, range]) -> None:
         raise ConfigError(
             "no rooms are asked for: give at least one of " + ", ".join(f"num_{n}=" for n in asked)
         )
+    return {name: numbers[name][: max(count, _listed(output, name))] for name, count in asked.items()}
+
+
+def _listed(output: Path, split: str) -> int:
+    """Return how many scans of a split were listed by an earlier call."""
+    path = output / "scannet" / f"scannetv2_{split}.txt"
+    return len(read_split(output / "scannet", split) or ()) if path.is_file() else 0

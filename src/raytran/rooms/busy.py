@@ -15,29 +15,33 @@ from raytran.rooms.parametric.clutter import IN_SHELVES, ON_FLOORS, ON_SEATS, ON
 
 ROOM_KINDS = {
     "office": 0.25,
-    "living": 0.17,
+    "living": 0.25,
     "bedroom": 0.1,
-    "dining": 0.15,
-    "meeting": 0.17,
-    "bathroom": 0.16,
+    "dining": 0.1,
+    "meeting": 0.12,
+    "bathroom": 0.18,
 }
 """What a room can be used for, and how often."""
 
 _EXTRAS: dict[str, dict[str, float]] = {
     "office": {
-        **{"chair": 7, "table": 6, "trashbin": 3, "display": 3, "bookshelf": 2, "cabinet": 1},
-        **{"printer": 1, "lamp": 1},
+        **{"chair": 3, "table": 4, "trashbin": 4, "display": 6, "bookshelf": 4, "cabinet": 4, "sofa": 2},
+        **{"printer": 1, "lamp": 0.5},
     },
     "living": {
-        **{"chair": 5, "table": 6, "sofa": 2, "lamp": 2, "bookshelf": 2, "cabinet": 1, "trashbin": 1},
-        **{"pillow": 1},
+        **{"chair": 2, "table": 5, "sofa": 4, "display": 2, "bookshelf": 3, "cabinet": 3, "trashbin": 2},
+        **{"lamp": 1.5, "pillow": 1},
     },
-    "bedroom": {"chair": 3, "table": 3, "cabinet": 2, "lamp": 2, "bookshelf": 1, "trashbin": 1, "pillow": 1},
-    "dining": {"chair": 6, "table": 5, "trashbin": 2, "cabinet": 1, "bookshelf": 1, "lamp": 1},
+    "bedroom": {
+        **{"chair": 2, "table": 3, "cabinet": 3, "display": 1, "sofa": 1, "bookshelf": 2, "trashbin": 2},
+        **{"lamp": 1.5, "pillow": 1},
+    },
+    "dining": {"chair": 3, "table": 4, "trashbin": 2, "cabinet": 3, "sofa": 2, "bookshelf": 2, "lamp": 1},
     "meeting": {
-        **{"chair": 7, "table": 5, "display": 2, "trashbin": 2, "bookshelf": 1, "cabinet": 1, "printer": 1},
+        **{"chair": 3, "table": 4, "display": 4, "trashbin": 2, "sofa": 2, "bookshelf": 3, "cabinet": 3},
+        **{"printer": 1},
     },
-    "bathroom": {"cabinet": 2, "trashbin": 2, "chair": 1, "lamp": 0.5},
+    "bathroom": {"cabinet": 3, "trashbin": 3, "chair": 0.5, "lamp": 0.5},
 }
 
 
@@ -54,7 +58,7 @@ class BusyFurnisher(Furnisher):
         for group in _GROUPS[kind]:
             group(self)
         if kind != "bathroom":
-            if rng.random() < 0.2:
+            if rng.random() < 0.1:
                 self.row_at_wall(
                     "chair", int(rng.integers(2, 6)), "dining chair", "armed chair", "office chair"
                 )
@@ -175,7 +179,7 @@ def _few_seats(furnisher: BusyFurnisher) -> None:
 
 
 def _many_seats(furnisher: BusyFurnisher) -> None:
-    furnisher.table_with_chairs(most=14)
+    furnisher.table_with_chairs(most=12)
 
 
 _GROUPS: dict[str, tuple[Callable[[BusyFurnisher], None], ...]] = {

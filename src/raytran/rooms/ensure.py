@@ -52,8 +52,7 @@ def ensure_rooms(
             _log.warning("using the rooms in %s as they are, made with %s", output, " ".join(different))
         return
     count = settings["num_train"] + settings["num_val"]
-    _check_allowed(output, allowed, Path(usual), count)
-    _log.info("making %d rooms in %s (first use; an interrupted set is completed)", count, output.resolve())
+    _begin(output, allowed, Path(usual), count)
     generate_rooms(output, **settings)
 
 
@@ -88,9 +87,7 @@ def ensure_rooms_v1(
     asked = (num_train, num_val, num_test)
     if rooms_are_complete(output, LISTS_V1) and _enough(output, LISTS_V1, asked):
         return
-    count = sum(asked)
-    _check_allowed(output, allowed, Path(usual), count)
-    _log.info("making %d rooms in %s (first use; an interrupted set is completed)", count, output.resolve())
+    _begin(output, allowed, Path(usual), sum(asked))
     generate_rooms_v1(
         output,
         num_train=num_train,
@@ -130,18 +127,16 @@ def ensure_rooms_v2(
     """
     output = Path(output)
     asked = (num_train, num_val)
-    if rooms_are_complete(output) and _enough(output, LISTS, asked):
+    if rooms_are_complete(output, LISTS) and _enough(output, LISTS, asked):
         return
-    count = sum(asked)
-    _check_allowed(output, allowed, Path(usual), count)
-    _log.info("making %d rooms in %s (first use; an interrupted set is completed)", count, output.resolve())
+    _begin(output, allowed, Path(usual), sum(asked))
     generate_rooms_v2(
         output, num_train=num_train, num_val=num_val, cads=cads, processes=processes, progress=progress
     )
 
 
-def _check_allowed(output: Path, allowed: bool | str, usual: Path, count: int) -> None:
-    """Raise unless rooms may be made in ``output``: a mistyped path would cost half an hour.
+def _begin(output: Path, allowed: bool | str, usual: Path, count: int) -> None:
+    """Say that rooms are made in ``output``, if they may be: a mistyped path would cost half an hour.
 
     Raises:
         ConfigError: they may not, or ``allowed`` is no such choice.
@@ -149,14 +144,14 @@ def _check_allowed(output: Path, allowed: bool | str, usual: Path, count: int) -
     if not isinstance(allowed, bool) and allowed != "auto":
         raise ConfigError(f"unknown rooms.make={allowed}: choose auto, true or false")
     begun = (output / RECORD).exists() or output.resolve() == usual.resolve()
-    if allowed is True or (allowed == "auto" and begun):
-        return
-    others = [path.name for path in output.parent.glob("*") if (path / RECORD).is_file()]
-    meant = get_close_matches(output.name, others, n=1)
-    question = f"is {output.with_name(meant[0])} meant? " if meant else ""
-    raise ConfigError(
-        f"there are no rooms in data.root={output}: {question}rooms.make=true makes {count} of them there"
-    )
+    if not (allowed is True or (allowed == "auto" and begun)):
+        others = [path.name for path in output.parent.glob("*") if (path / RECORD).is_file()]
+        meant = get_close_matches(output.name, others, n=1)
+        question = f"is {output.with_name(meant[0])} meant? " if meant else ""
+        raise ConfigError(
+            f"there are no rooms in data.root={output}: {question}rooms.make=true makes {count} of them there"
+        )
+    _log.info("making %d rooms in %s (first use; an interrupted set is completed)", count, output.resolve())
 
 
 def rooms_are_complete(output: Path, lists: Sequence[str] = LISTS) -> bool:

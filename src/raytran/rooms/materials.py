@@ -163,18 +163,30 @@ class TextureLibrary:
         Returns:
             ``(n,)`` in [0, 1].
         """
-        density = (SIZE / self.side)[texture]
-        # The exponent of the footprint in texels is the level whose texels are as large as the pixel.
-        level = np.frexp(footprint * density)[1].clip(0, LEVELS - 1)
-        column = np.floor(u * density).astype(np.int32) & (SIZE - 1)
-        row = np.floor(v * density).astype(np.int32) & (SIZE - 1)
-        return self.texels[texel_index(texture, level, row, column)]
+        return self.texels[texel_index(self.side, texture, u, v, footprint)]
 
 
 def texel_index(
-    texture: NDArray[np.int32], level: NDArray[np.int32], row: NDArray[np.int32], column: NDArray[np.int32]
+    side: NDArray[np.float32],
+    texture: NDArray[np.int32],
+    u: NDArray[np.float32],
+    v: NDArray[np.float32],
+    footprint: NDArray[np.float32],
 ) -> NDArray[np.int32]:
-    """Return where the texels ``(n,)`` lie in an array of all levels of all textures, one after another."""
+    """Return where the texels ``(n,)`` lie in an array of all levels of all textures, one after another.
+
+    Args:
+        side: ``(textures,)`` metres after which each repeats.
+        texture: this and the rest as of ``TextureLibrary.sample``.
+        u: see there.
+        v: see there.
+        footprint: see there.
+    """
+    density = (SIZE / side)[texture]
+    # The exponent of the footprint in texels is the level whose texels are as large as the pixel.
+    level = np.frexp(footprint * density)[1].clip(0, LEVELS - 1)
+    column = np.floor(u * density).astype(np.int32) & (SIZE - 1)
+    row = np.floor(v * density).astype(np.int32) & (SIZE - 1)
     start = texture * _LEVEL_START[-1] + _LEVEL_START[level]
     index: NDArray[np.int32] = start + ((row >> level) << (LEVELS - 1 - level)) + (column >> level)
     return index

@@ -6,7 +6,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from pathlib import Path
 
-from raytran.rooms.benchmark import check_numbers, listed_count
+from raytran.rooms.benchmark import scan_numbers
 from raytran.rooms.generate import RoomSplit, RoomsReport, make_splits
 from raytran.rooms.scene import RoomSettings
 
@@ -59,14 +59,12 @@ def generate_rooms_v2(
         DataError: ``output`` holds other rooms, or ``cads`` holds no model that can be used.
     """
     output = Path(output)
-    asked = {"train": num_train, "val": num_val}
-    check_numbers(asked, _NUMBERS)
-    counts = {name: max(count, listed_count(output, name)) for name, count in asked.items()}
+    numbers = scan_numbers(output, {"train": num_train, "val": num_val}, _NUMBERS)
     models = {"train": _TRAIN_MODELS, "val": _VAL_MODELS}
     splits = [
         RoomSplit(
             name,
-            numbers[: counts[name]],
+            numbers[name],
             SETTINGS.frames,
             models[name],
             textures=number,
@@ -74,7 +72,7 @@ def generate_rooms_v2(
             mixed=True,
             look="world",
         )
-        for number, (name, numbers) in enumerate(_NUMBERS.items())
+        for number, name in enumerate(_NUMBERS)
     ]
     claim = {"format": FORMAT, **asdict(SETTINGS)}
     return make_splits(

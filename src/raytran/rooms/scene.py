@@ -6,7 +6,7 @@ from __future__ import annotations
 import colorsys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,25 +132,55 @@ def _furnish(settings: RoomSettings, pool: ModelPool, rng: np.random.Generator) 
 def _record(settings: RoomSettings, layout: Layout, rng: np.random.Generator, textures: int) -> Scene | None:
     """Walk a camera through the room and remove objects it sees too rarely; None if too few remain."""
     paints = [_paint_object(placed, rng) for placed in layout.objects]
-    renderer = _make_renderer(layout.room, layout.objects, paints, textures)
+
+    def draw(objects: Sequence[int]) -> Renderer:
+        placed = [layout.objects[i] for i in objects]
+        return _make_renderer(layout.room, placed, [paints[i] for i in objects], textures)
+
+    intrinsics = make_intrinsics(settings.image_size, rng)
+    walked = _walk(settings, layout, rng, draw, intrinsics=intrinsics, image_size=settings.image_size)
+    if walked is None:
+        return None
+    objects, cameras, renderer = walked
+    renderer.expose(cameras[:: max(1, len(cameras) // 6)], brightness=rng.uniform(0.35, 0.55))
+    return Scene(layout.room, objects, tuple(cameras), renderer, _draw_scan_frame(layout.room, rng))
+
+
+def _walk(
+    settings: RoomSettings,
+    layout: Layout,
+    rng: np.random.Generator,
+    draw: Callable[[Sequence[int]], Renderer],
+    **camera: Any,
+) -> tuple[tuple[PlacedObject, ...], list[Pinhole], Renderer] | None:
+    """Walk a camera through a room, without the objects that it sees too rarely.
+
+    Args:
+        settings: what all rooms have in common.
+        layout: the furnished room.
+        rng: source of all choices.
+        draw: returns a renderer of the room with the objects of these numbers.
+        camera: arguments of ``plan_path``.
+
+    Returns:
+        the objects that remain, the cameras, and a renderer of the room with these objects; None if too few
+        remain.
+    """
+    renderer = draw(range(len(layout.objects)))
     cameras, missed = plan_path(
         room=layout.room,
         boxes=Boxes.joined([placed.box for placed in layout.objects]),
         renderer=renderer,
-        intrinsics=make_intrinsics(settings.image_size, rng),
-        image_size=settings.image_size,
         frames=settings.frames,
         rng=rng,
+        **camera,
     )
-    objects = tuple(layout.objects)
-    if missed.any():
-        remaining = _without(layout.objects, missed)
-        if len(remaining) < settings.min_objects:
-            return None
-        objects = _renumbered(layout.objects, remaining)
-        renderer = _make_renderer(layout.room, objects, [paints[i] for i in remaining], textures)
-    renderer.expose(cameras[:: max(1, len(cameras) // 6)], brightness=rng.uniform(0.35, 0.55))
-    return Scene(layout.room, objects, tuple(cameras), renderer, _draw_scan_frame(layout.room, rng))
+    if not missed.any():
+        return tuple(layout.objects), cameras, renderer
+    remaining = _without(layout.objects, missed)
+    if len(remaining) < settings.min_objects:
+        return None
+    return _renumbered(layout.objects, remaining), cameras, draw(remaining)
 
 
 def _furnish_busily(settings: RoomSettings, pool: ModelPool, rng: np.random.Generator) -> Layout:
@@ -177,33 +207,32 @@ def _film(settings: RoomSettings, layout: Layout, rng: np.random.Generator, text
     paints = _alike(layout.objects, object_finish, rng)
     littered = [clutter_finish(placed, rng) for placed in layout.clutter]
     standing = Boxes.joined([placed.box for placed in layout.clutter] + [layout.room.keep_free()])
-    renderer = _photographic(layout.room, layout.objects, paints, layout.clutter, littered, textures)
-    cameras, missed = plan_path(
-        room=layout.room,
-        boxes=Boxes.joined([placed.box for placed in layout.objects]),
-        renderer=renderer,
-        intrinsics=make_intrinsics(image_size, rng, handling.field_of_view),
-        image_size=image_size,
-        frames=settings.frames,
-        rng=rng,
-        handling=handling,
-        clutter=standing,
-    )
-    objects = tuple(layout.objects)
-    if missed.any():
-        remaining = _without(layout.objects, missed)
-        if len(remaining) < settings.min_objects:
-            return None
-        objects = _renumbered(layout.objects, remaining)
-        kept = [i for i, placed in enumerate(layout.clutter) if placed.parent in (FLOOR, *remaining)]
-        renderer = _photographic(
+
+    def draw(objects: Sequence[int]) -> Renderer:
+        # What lies on an object goes with it.
+        kept = [i for i, placed in enumerate(layout.clutter) if placed.parent in (FLOOR, *objects)]
+        return _photographic(
             layout.room,
-            objects,
-            [paints[i] for i in remaining],
+            [layout.objects[i] for i in objects],
+            [paints[i] for i in objects],
             [layout.clutter[i] for i in kept],
             [littered[i] for i in kept],
             textures,
         )
+
+    walked = _walk(
+        settings,
+        layout,
+        rng,
+        draw,
+        intrinsics=make_intrinsics(image_size, rng, handling.field_of_view),
+        image_size=image_size,
+        handling=handling,
+        clutter=standing,
+    )
+    if walked is None:
+        return None
+    objects, cameras, renderer = walked
     poses = np.stack([camera.room_from_camera for camera in cameras])
     calibrated = cameras[0].intrinsics.copy()
     calibrated[:2] *= 1 + rng.normal(0, 0.007)

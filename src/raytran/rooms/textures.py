@@ -44,11 +44,8 @@ class PhotoTextures:
         footprint: NDArray[np.float32],
     ) -> NDArray[np.float32]:
         """Return ``(3, n)`` colours in [0, 1]; arguments as of ``TextureLibrary.sample``."""
-        density = (SIZE / self.side)[texture]
-        level = np.frexp(footprint * density)[1].clip(0, LEVELS - 1)
-        column = np.floor(u * density).astype(np.int32) & (SIZE - 1)
-        row = np.floor(v * density).astype(np.int32) & (SIZE - 1)
-        found = self.texels[texel_index(texture, level, row, column)].view(np.uint8).reshape(-1, 4)
+        texels = self.texels[texel_index(self.side, texture, u, v, footprint)]
+        found = texels.view(np.uint8).reshape(-1, 4)
         return np.ascontiguousarray(found[:, :3].T, dtype=np.float32) * np.float32(1 / 255)
 
 

@@ -21,7 +21,7 @@ from omegaconf import OmegaConf
 from raytran.errors import ConfigError
 from raytran.run.config_dir import config_dir
 
-_OF_DATA = ("data.root", "data.dataset.cache_dir", "data.make.cads")
+_OF_DATA = ("data.root", "data.more_roots", "data.dataset.cache_dir", "data.make.cads")
 _OF_TRAINING = (
     *("init_from", "resume", "outputs", "output_dir", "model.backbone.encoder.weights", *_OF_DATA),
     *(
@@ -45,6 +45,7 @@ PATH_SETTINGS = {
         *("captures", "boxes", "arkitscenes"),
     ),
     "export_model": ("checkpoint", "output", "calibration"),
+    "poses": ("video", "output"),
     "plan": ("scene", "model.backbone.encoder.weights"),
     "view": ("folder",),
     "demo": ("output",),
@@ -54,6 +55,7 @@ PATH_SETTINGS = {
 _TYPED_ALONE = {
     "predict": "scene",
     "view": "folder",
+    "poses": "video",
     "plan": "scene",
     "demo": "output",
     "prepare": "check",
@@ -64,7 +66,7 @@ _TYPED_ALONE = {
 
 _WEIGHTS = (".ckpt", ".safetensors")
 
-_LISTS = ("draw_with",)
+_LISTS = ("draw_with", "data.more_roots")
 """Those that take several, in brackets."""
 
 _NULL_IN_GROUPS = ("data.make.cads", "model.backbone.encoder.weights")

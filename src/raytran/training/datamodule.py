@@ -7,7 +7,7 @@ import logging
 import math
 import os
 import shutil
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from raytran.data.augment import Augmentation
 from raytran.data.collate import collate_scenes
+from raytran.data.dataset import JoinedScenes
 from raytran.data.workers import become_worker
 from raytran.errors import DataError
 from raytran.setting_limits import check_settings
@@ -43,6 +44,8 @@ class SceneDataModule(pl.LightningDataModule):
         dataset: ``dataset(root=…, split="train"|"val", view_choice=…, num_views=…, targets=…,
             augmentation=…)``; validation asks the result for ``[index]``, training for ``[epoch, index]``.
         targets: what batches must hold, see ``SceneDataset``.
+        more_roots: further folders like ``root``, whose training scenes are added to those of ``root``;
+            scores are of ``root`` alone, and nothing is made there.
         make: ``make(output=root)`` writes the data and does nothing where they are complete; None if they are
             there in any case.
         num_views: frames of a training scene, drawn at random anew each time.
@@ -64,6 +67,7 @@ class SceneDataModule(pl.LightningDataModule):
         root: str | Path,
         dataset: Callable[..., Dataset[SceneBatch]],
         targets: Collection[str],
+        more_roots: Sequence[str | Path] = (),
         make: Callable[..., Any] | None = None,
         num_views: int = 20,
         val_views: int = 20,
@@ -85,6 +89,7 @@ class SceneDataModule(pl.LightningDataModule):
             }
         )
         self.root = Path(root)
+        self.more_roots = tuple(map(Path, more_roots))
         self.name = name
         self._dataset = dataset
         self._targets = tuple(targets)
@@ -104,15 +109,24 @@ class SceneDataModule(pl.LightningDataModule):
             self._make(output=self.root)
 
     def split(self, split: str, *, training: bool = False) -> Dataset[SceneBatch]:
-        """Return the scenes of ``train`` or ``val``; for training with random views and augmented."""
-        return self._dataset(
-            root=self.root,
-            split=split,
-            targets=self._targets,
-            view_choice="random" if training else "even",
-            num_views=self._num_views if training else self._val_views,
-            augmentation=self._augmentation if training else None,
-        )
+        """Return the scenes of ``train`` or ``val``.
+
+        Args:
+            split: which.
+            training: of all roots, with random views and augmented.
+        """
+        datasets = [
+            self._dataset(
+                root=root,
+                split=split,
+                targets=self._targets,
+                view_choice="random" if training else "even",
+                num_views=self._num_views if training else self._val_views,
+                augmentation=self._augmentation if training else None,
+            )
+            for root in (self.root, *(self.more_roots if training else ()))
+        ]
+        return datasets[0] if len(datasets) == 1 else JoinedScenes(datasets)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the place in the stream of scenes after the last whole step, for the checkpoint."""

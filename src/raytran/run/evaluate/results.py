@@ -135,7 +135,7 @@ def read_curves(folders: Iterable[str | Path]) -> dict[str, Curves]:
         except (DataError, ValueError, KeyError, TypeError) as error:
             raise ConfigError(
                 f"{path} has no curves of protocol strict to draw ({type(error).__name__}): draw_with= takes "
-                "folders that raytran.evaluate wrote with protocol=strict or all, or for a checkpoint"
+                "folders that raytran evaluate wrote with protocol=strict or all, or for a checkpoint"
             ) from error
         by_folder[str(folder)] = curves
     return by_folder

@@ -86,7 +86,7 @@ def calibrated(checkpoint: Mapping[str, Any], source: Path, evaluation: Path) ->
     Args:
         checkpoint: what ``read_checkpoint`` returned.
         source: where from.
-        evaluation: folder that ``raytran.evaluate`` wrote of this very file.
+        evaluation: folder that ``raytran evaluate`` wrote of this very file.
 
     Raises:
         ConfigError: there is no such evaluation, it is of another file, or its scores tell nothing.
@@ -99,7 +99,7 @@ def calibrated(checkpoint: Mapping[str, Any], source: Path, evaluation: Path) ->
     except (DataError, KeyError, TypeError) as error:
         raise ConfigError(
             f"{path} says nothing of scores ({type(error).__name__}): calibration= takes a folder that "
-            "raytran.evaluate wrote for this checkpoint"
+            "raytran evaluate wrote for this checkpoint"
         ) from error
     if of_file != file_digest(source):
         raise ConfigError(f"{path} is of another file than {source}: evaluate this one and give its folder")

@@ -7,7 +7,6 @@ import logging
 import os
 import re
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 from hydra.utils import instantiate
@@ -17,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 from raytran.backbone.backbone import Backbone
+from raytran.capture.sample_scene import scene_path
 from raytran.errors import ConfigError
 from raytran.geometry.grid import VoxelGrid
 from raytran.model import RayTran
@@ -163,7 +163,7 @@ def _device(gpu: str | None) -> tuple[str, int]:
 def _pairs_per_pixel(cfg: DictConfig, model: RayTran, load: Load) -> float:
     """Trace the rays of as many cameras as are trained with, and return the voxels that a pixel sees."""
     views = load.views
-    cameras = walk(views) if cfg.scene is None else recorded(Path(cfg.scene), views)
+    cameras = walk(views) if cfg.scene is None else recorded(scene_path(cfg.scene), views)
     grid = VoxelGrid(model.grid_resolution, model.grid_extent, cameras.position.mean(dim=0))
     pairs = listed(model.trace(cameras.scaled_to(load.image_size), grid))
     return len(pairs) / pairs.num_pixels

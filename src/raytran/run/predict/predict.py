@@ -17,6 +17,7 @@ from omegaconf import DictConfig
 from raytran.capture.open import open_scene, parse_intrinsics
 from raytran.capture.orientation import WorldSettings
 from raytran.capture.recording import Intrinsics
+from raytran.capture.sample_scene import scene_path
 from raytran.checkpoints.file import checkpoint_path, shipped_weights
 from raytran.checkpoints.load import PredictionSettings, load_model, prediction_settings
 from raytran.checkpoints.network import trusted_packages
@@ -77,7 +78,7 @@ def predict(cfg: DictConfig) -> Path:
         DataError: the scene's folder is missing or damaged.
     """
     began = time.monotonic()
-    recording = Path(cfg.scene).resolve()
+    recording = scene_path(cfg.scene)
     output = Path(cfg.output) if cfg.output else PREDICTIONS / _scene_id(recording)
     world = WorldSettings(up=cfg.up, scale=cfg.scale, convention=cfg.convention, check=cfg.check)
     intrinsics = parse_intrinsics(cfg.intrinsics)
@@ -259,7 +260,7 @@ def _read_room(
     model: RayTran,
 ) -> RoomViews:
     """Return the frames that the network is given, and its volumes."""
-    scene = Path(cfg.scene).resolve()
+    scene = scene_path(cfg.scene)
     with open_scene(scene, format=cfg.format, settings=world, intrinsics=intrinsics) as scan:
         return read_room(
             scan,
