@@ -41,7 +41,6 @@ WITHOUT_ARGUMENTS = {
     "raytran.extensions.proposal_queries.ProposalLoss",
     "raytran.extensions.denoising.DenoisingLoss",
     "raytran.extensions.box_refinement.BoxRefinement",
-    "raytran.extensions.box_voxels.BoxVoxelShapeHead",
 }
 # Part of the layout that scan2cad_dataset stands for.
 FIXED_BY_LAYOUT = {"scans_root", "scene_ids", "annotations", "shapenet_root"}

@@ -134,7 +134,7 @@ def test_the_log_names_weights_device_steps_and_seconds(scene, oracle, tmp_path,
 def test_the_shipped_weights_say_what_they_do_not_know(scene, oracle, tmp_path, caplog):
     caplog.set_level("INFO")
     module.predict(config(scene, tmp_path / "out", checkpoint="default"))
-    assert caplog.messages[0].startswith("raytran's own weights, rooms-v1-laptop.safetensors (preset tiny")
+    assert caplog.messages[0].startswith("raytran's own weights, rooms-laptop.safetensors (preset tiny")
     assert [record.message for record in caplog.records if record.levelname == "WARNING"].count(
         module.ONLY_ROOMS
     ) == 1
