@@ -14,6 +14,7 @@ from raytran.run.demo.page import ShownScene, headline, write_page
 from raytran.run.predict.write_scene import PredictedScene, write_scene
 from raytran.run.train.fit import FitResult
 from raytran.structs import ObjectSet, SceneBatch, ScenePrediction, Views
+from raytran.viewer import has_viser
 
 UPRIGHT = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
@@ -33,7 +34,7 @@ class Page(HTMLParser):
         values = dict(attrs)
         self.sources += [values["src"]] if "src" in values else []
         self.links += [values["href"]] if "href" in values else []
-        if tag not in ("meta", "img", "br"):
+        if tag not in ("meta", "img", "br", "wbr"):
             self.open.append(tag)
 
     def handle_endtag(self, tag):
@@ -58,6 +59,7 @@ def metrics(n_good: int) -> dict:
     return {
         "strict": {"per_class": per_class, "per_threshold": thresholds, **total},
         "occupancy_iou": 0.25,
+        "num_views": 12,
     }
 
 
@@ -148,3 +150,34 @@ def test_the_page_says_everything_and_closes_its_tags(page):
     assert "all 2 min 15 s" in flat
     assert "bathtub" not in flat, "a class that occurs nowhere has no row"
     assert set(parsed.sources) == {"data:"}, "it stands alone"
+
+
+def test_one_object_is_one_and_the_frames_are_counted(page):
+    flat = re.sub(r"\s+", " ", Page(page).text)
+    assert "1 object was predicted, 1 is there." in flat
+    assert "12 of each room" in flat
+
+
+def test_a_room_can_be_looked_at_in_3d(page, tmp_path):
+    links = Page(page).links
+    for name in ("scene0000_00", "scene0001_00"):
+        looks = f"predictions/{name}/prediction.html"
+        assert (looks in links) == (tmp_path / looks).is_file() == has_viser()
+    assert not any(link.endswith(".gif") for link in links), "no link to what is not there"
+    assert f"raytran view {tmp_path / 'predictions'}</code>" in page
+
+
+def test_long_names_of_files_break_between_folders_alone(page):
+    (files,) = re.findall(r'<dl class="card files">(.*?)</dl>', page, flags=re.DOTALL)
+    assert "predictions/<wbr>scene0000_00/<wbr>scene.glb</code>" in files
+    # A cell that breaks anywhere beside one that never does is one letter wide on a phone.
+    style = page[page.index("<style>") : page.index("</style>")]
+    assert "anywhere" not in re.search(r"dl\.files dd \{[^}]*\}", style).group()
+
+
+def test_plots_are_dark_in_the_dark_and_do_not_shrink(page):
+    assert page.count('<img class="plot"') == 2 * 2 + 1, "plan and layers of two rooms, and the curves"
+    style = re.sub(r"\s+", " ", page)
+    dark = style[style.index("{ /* Black ink") :]
+    assert "img.plot { background: #fff; filter: invert(" in dark[:300]
+    assert re.search(r"\.plot \{ min-width: \d+rem; \}", style)
