@@ -113,8 +113,8 @@ def write_page(
         summary="Rooms were generated, a small network was trained from scratch through the three stages of "
         f"the paper, and then asked for the objects of the {_scenes(metrics, 'train')} training rooms and of "
         f"{_scenes(metrics, 'val')} held-out ones: class, position, size, heading and mesh, from posed "
-        f"frames alone, {_frames(metrics)} of each room. From other frames, or from more of them, the numbers "
-        "are others.",
+        f"frames alone, {_frames(metrics)} of each room. From other frames, or from more of them, the "
+        "numbers are others.",
         splits=splits,
         sections=[*(_room(scene, output) for scene in scenes), _training(output, fits)],
         view=f"raytran view {shlex.quote(str(output / 'predictions'))}",
@@ -194,12 +194,11 @@ def _room(scene: ShownScene, output: Path) -> dict[str, Any]:
             contact_sheet(folder / "overlays.jpg", overlays, columns=2),
             "Predicted boxes and meshes over frames; the front face of a box is drawn bold.",
         ),
-        {
-            **_picture(
-                draw_frames(folder / "frames.jpg", batch.views), "Some of the frames the network was given."
-            ),
-            "wide": True,
-        },
+        _picture(
+            draw_frames(folder / "frames.jpg", batch.views),
+            "Some of the frames the network was given.",
+            wide=True,
+        ),
     ]
     if prediction.foreground is not None:
         truth = None if batch.foreground is None else batch.foreground[0]
@@ -230,13 +229,13 @@ def _were(count: int) -> str:
     return "1 object was" if count == 1 else f"{count} objects were"
 
 
-def _picture(path: Path, caption: str) -> dict[str, Any]:
-    return {"path": path, "caption": caption, "wide": False, "plot": False}
+def _picture(path: Path, caption: str, *, wide: bool = False) -> dict[str, Any]:
+    return {"path": path, "caption": caption, "wide": wide, "plot": False}
 
 
 def _plot(path: Path, caption: str, *, wide: bool = False) -> dict[str, Any]:
     """Return a picture with text on white paper, which is not to shrink and in the dark not to shine."""
-    return {"path": path, "caption": caption, "wide": wide, "plot": True}
+    return _picture(path, caption, wide=wide) | {"plot": True}
 
 
 def _relative(path: Path, output: Path) -> str:
