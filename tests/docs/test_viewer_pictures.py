@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The browser that draws the documentation's pictures, on a page of the test's own; skipped without Chromium."""
+"""The browser that draws the documentation's pictures, on a page of the test's own; needs Chromium."""
 
 from __future__ import annotations
 
