@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import pytest
 import torch
@@ -109,20 +110,25 @@ def test_headline():
     assert headline(metrics(0) | {"shape": {"iou": None}})["shape IoU"] == "–"
 
 
-@pytest.fixture
-def page(tmp_path) -> str:
-    logs = tmp_path / "training" / "stage1"
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("demo")
+
+
+@pytest.fixture(scope="module")
+def page(folder) -> str:
+    logs = folder / "training" / "stage1"
     logs.mkdir(parents=True)
     (logs / "metrics.csv").write_text("epoch,step,train/total\n0,1,2.0\n0,2,1.0\n")
     fit = FitResult(logs, logs / "checkpoints" / "last.ckpt", 2, 1.0, {})
     path = write_page(
-        tmp_path,
-        scenes=[scene("train", "scene0000_00", tmp_path), scene("val", "scene0001_00", tmp_path)],
+        folder,
+        scenes=[scene("train", "scene0000_00", folder), scene("val", "scene0001_00", folder)],
         metrics={"train": metrics(5), "val": metrics(1)},
         fits=[fit],
         seconds={"rooms": 9.96, "training": 125.0},
     )
-    assert path == tmp_path / "index.html"
+    assert path == folder / "index.html"
     return re.sub(r"data:[^\"]+", "data:", path.read_text())
 
 
@@ -134,10 +140,10 @@ def test_splits_are_told_apart(page):
     assert "A held-out room: scene0001_00" in page
 
 
-def test_pictures_and_files_are_there(page, tmp_path):
+def test_pictures_and_files_are_there(page, folder):
     assert page.count('src="data:"') == 2 * 5 + 1
     assert 'href="predictions/scene0001_00/scene.glb"' in page
-    assert (tmp_path / "predictions" / "scene0001_00" / "scene.glb").is_file()
+    assert (folder / "predictions" / "scene0001_00" / "scene.glb").is_file()
     assert 'href="training/stage1/checkpoints/last.ckpt"' in page
 
 
@@ -160,12 +166,12 @@ def test_one_object_is_one_and_the_frames_are_counted(page):
     assert "12 of each room" in flat
 
 
-def test_a_room_can_be_looked_at_in_3d(page, tmp_path):
+def test_a_room_can_be_looked_at_in_3d(page, folder):
     links = Page(page).links
     assert "predictions/scene0000_00/prediction.html" in links
     assert "predictions/scene0001_00/prediction.html" not in links, "no link to what is not there"
     assert not any(link.endswith(".gif") for link in links)
-    assert f"raytran view {tmp_path / 'predictions'}</code>" in page
+    assert f"raytran view {folder / 'predictions'}</code>" in page
 
 
 def test_long_names_of_files_break_between_folders_alone(page):
