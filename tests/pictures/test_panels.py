@@ -77,3 +77,13 @@ def test_low_voxels_show_in_the_left_slices_and_truth_below(tmp_path):
     top_left, top_right, bottom_left, bottom_right = dark_share(path)
     assert min(top_left, bottom_right) > 0.2
     assert max(top_right, bottom_left) < 0.1
+
+
+def test_nothing_of_the_layers_is_cut_at_the_edge(tmp_path):
+    path = draw_occupancy(tmp_path / "o.png", torch.ones(40, 40, 8), None, height=3.0)
+    image = np.asarray(Image.open(path).convert("L"))
+    border = np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
+    assert border.min() == 255
+    # Headings stand above the maps: rows with ink come before the first row that is mostly ink.
+    dark = (image < 100).mean(axis=1)
+    assert 0 < (dark > 0).argmax() + 8 < (dark > 0.4).argmax()

@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from raytran.errors import DataError
+from raytran.viewer.attention import ReadPixels
 
 from .conftest import write_result
 
 viser = pytest.importorskip("viser", reason="needs viser (pip install 'raytran[viewer]')")
-from raytran.viewer.app import ViewerApp, draw_boxes, first_hit  # noqa: E402 - after the check
+from raytran.viewer.app import ViewerApp, describe_reads, draw_boxes, first_hit  # noqa: E402 - after the check
 from raytran.viewer.scene import Shown, draw_reads  # noqa: E402
 from raytran.viewer.server import quiet_server  # noqa: E402
 
@@ -124,7 +125,7 @@ def test_a_click_on_a_voxel_lights_up_the_pixels_it_read(app):
         assert np.array_equal(frustum.image, draw_reads(app.scene.images[n], pixels, n))
     app.select_voxel(None)
     assert app.pixels is None
-    assert "shift-click" in app.reads.content
+    assert "Shift-click" in app.reads.content
     assert np.array_equal(app.nodes.frames[0].image, app.scene.images[0])
 
 
@@ -135,7 +136,7 @@ def test_shift_click_finds_meshes_and_voxels_that_are_hidden(app):
     assert app.reads.content.startswith("voxel (3, 4, 2) read")
     set_value(app.classes[0], False)
     click(app, (x, y, 0.3), start=(x, y, 8.0))
-    assert "shift-click" in app.reads.content
+    assert "Shift-click" in app.reads.content
     click(app, (1.2, 0.3, 0.4), start=(1.2, 0.3, 8.0))
     assert app.reads.content.startswith("voxel (10, 8, 1) read")
 
@@ -200,7 +201,7 @@ def test_names_give_way_to_surer_ones_as_the_camera_moves(app):
 
 
 def test_a_camera_looks_from_a_frame_and_back(app):
-    camera = SimpleNamespace()
+    camera = SimpleNamespace(aspect=1.5)
     client = SimpleNamespace(camera=camera, atomic=app.server.atomic)
     app.select_frame(1)
     app._look_from_frame(client)
@@ -209,5 +210,99 @@ def test_a_camera_looks_from_a_frame_and_back(app):
     np.testing.assert_allclose(viser.transforms.SO3(camera.wxyz).as_matrix(), pose[:3, :3], atol=1e-6)
     assert np.tan(camera.fov / 2) == pytest.approx(24 / (0.8 * 64))
     assert app.nodes.frames[1].scale > 10 * app.nodes.frames[0].scale
-    app._look_home(client)
+    app._look(client)
     np.testing.assert_allclose(camera.position, app.server.initial_camera.position)
+    app._look(client, "top")
+    assert camera.position[2] > 5
+    np.testing.assert_allclose(camera.position[:2], camera.look_at[:2], atol=0.05)
+    app._look(None)
+
+
+def test_keys_and_buttons_look_at_all_of_the_scene(app, scenes):
+    for _ in range(2):  # a scene that is opened later has them too, once
+        commands = list(app.server.gui._command_handle_from_uuid.values())
+        assert [command.hotkey for command in commands] == ["F", "T", "N"]
+        app.open("plain")
+    camera = SimpleNamespace(aspect=0.5)
+    client = SimpleNamespace(camera=camera, atomic=app.server.atomic)
+    commands = list(app.server.gui._command_handle_from_uuid.values())
+    commands[2]._impl.trigger_cb[0](SimpleNamespace(client=client))
+    assert camera.position[1] < camera.look_at[1] - 3
+    assert camera.position[2] == pytest.approx(camera.look_at[2])
+
+
+def test_who_looks_from_a_frame_stays_there(app, monkeypatch):
+    looks = []
+    monkeypatch.setattr(app.server, "get_clients", lambda: {0: "browser"})
+    monkeypatch.setattr(app, "_look_from_frame", looks.append)
+    app.select_frame(1)
+    app.nodes.set_backdrop(1)
+    assert [frustum.visible for frustum in app.nodes.frames.values()] == [n == 1 for n in range(5)]
+    app.select_voxel(np.array([1.2, 0.3, 0.4]))
+    assert (app.frame, app.nodes.backdrop, looks) == (1, 1, [])
+    assert app.picture.label == "000010, 2 of 5"
+    set_value(app.frame_slider, 3)
+    assert looks == ["browser"]
+    app.nodes.set_backdrop(None)
+    assert all(frustum.visible for frustum in app.nodes.frames.values())
+
+
+def test_a_finger_chooses_what_to_read_by_the_next_tap(app):
+    app._pick(None)
+    plain = [entry for entry in app.server.scene._scene_pointer_cb if entry.modifier is None]
+    event = SimpleNamespace(ray_origin=(1.2, 0.3, 8.0), ray_direction=(0.0, 0.0, -1.0))
+    plain[0].callback(event)
+    assert app.reads.content.startswith("voxel (10, 8, 1) read")
+    assert [entry.modifier for entry in app.server.scene._scene_pointer_cb] == ["shift"]
+
+
+def test_the_scale_of_the_voxels_is_seen_with_the_voxels(app):
+    assert not app.voxel_panel.visible
+    set_value(app.layers["voxels"], True)
+    assert app.voxel_panel.visible
+    assert app.nodes.voxels.visible
+
+
+def test_the_chosen_object_keeps_its_name(app):
+    far = SimpleNamespace(
+        position=np.array([0.0, 0.0, 400.0]),
+        wxyz=np.array([0.0, 1.0, 0.0, 0.0]),
+        fov=0.87,
+        image_height=800,
+        image_width=800,
+    )
+    app.move(far)
+    app.select_object(3)
+    assert [node.name.visible for node in app.nodes.objects] == [n == 3 for n in range(6)]
+    app.select_object(None)
+    assert [node.name.visible for node in app.nodes.objects] == [n == 0 for n in range(6)]
+
+
+def test_a_browser_begins_with_all_of_the_scene_in_its_window(app):
+    (connect,) = app.server._client_connect_cb
+    distance = []
+    for width in (390, 1280):
+        camera = SimpleNamespace(
+            position=np.array([0.0, 0.0, 9.0]),
+            wxyz=np.array([0.0, 1.0, 0.0, 0.0]),
+            fov=0.87,
+            image_height=800,
+            image_width=width,
+            aspect=width / 800,
+            on_update=lambda _: None,
+        )
+        connect(SimpleNamespace(camera=camera, atomic=app.server.atomic))
+        distance.append(np.linalg.norm(np.array(camera.position) - camera.look_at))
+    assert distance[0] > 1.5 * distance[1]
+
+
+def test_what_was_read_is_counted_in_words():
+    def reads(view):
+        count = len(view)
+        zeros = np.zeros(count, dtype=int)
+        return ReadPixels(np.array(view, dtype=int), zeros, zeros, np.full(count, 1 / count), (3, 4))
+
+    assert describe_reads((1, 2, 3), reads([1]), "ab") == "voxel (1, 2, 3) read 1 pixel of one frame, b."
+    assert describe_reads((1, 2, 3), reads([0, 1, 1, 1]), "ab") == (
+        "voxel (1, 2, 3) read 4 pixels of 2 frames, most from b 75%, a 25%."
+    )

@@ -20,7 +20,7 @@ def write_page(
 
     Args:
         path: HTML file.
-        template: name in ``view/templates``.
+        template: name in ``pictures/templates``.
         filters: further filters of the template.
         content: its variables.
 

@@ -103,7 +103,8 @@ def draw_occupancy(
         axes_row[0].set_ylabel(name, color=INK)
     for k, axes in enumerate(grid[0]):
         axes.set_title(f"z {edge[k]:+.1f} to {edge[k + 1]:+.1f} m", color=INK, fontsize=9)
-    figure.savefig(path)
+    # Maps keep their shape, so that the layout alone may push headings over the edge.
+    figure.savefig(path, bbox_inches="tight", pad_inches=0.1)
     return path
 
 

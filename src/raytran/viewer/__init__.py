@@ -8,6 +8,9 @@ from pathlib import Path
 
 from raytran.errors import ConfigError
 
+HTML = "prediction.html"
+"""A scene as one file, in the folder of its result."""
+
 MISSING = "the viewer is viser, which is not installed: pip install 'raytran[viewer]'"
 
 

@@ -26,12 +26,15 @@ from raytran.viewer.attention import ReadPixels
 from raytran.viewer.data import ViewerScene, read_viewer_scene
 from raytran.viewer.scene import (
     FIELD_OF_VIEW,
+    LOOKS,
     Floats,
     Pixels,
     SceneNodes,
     Shown,
     draw_reads,
     home,
+    in_plain_sight,
+    mark,
     names_with_room,
 )
 
@@ -42,13 +45,16 @@ _PANEL_WIDTH = 480
 """Pixels to which small frames are enlarged, about."""
 
 _LAYERS = ("meshes", "boxes", "names", "frames", "truth", "voxels", "grid")
+_KEYS = {"all": ("F", "fit all of the scene"), "top": ("T", "from the top"), "front": ("N", "look north")}
+"""Key and meaning of each of ``LOOKS``."""
+
 _COLORINGS: dict[str, Literal["probability", "views"]] = {
     "how likely it is occupied": "probability",
     "how many views saw it": "views",
 }
 _HOW_TO_READ = (
-    "Click a voxel, or shift-click anywhere: the pixels light up from which the network's last block "
-    "gathered the features of the first voxel or mesh there."
+    "Shift-click anywhere, or press the button and then tap: the pixels light up from which the network's "
+    "last block gathered the features of the first voxel or mesh there. With voxels shown, click or tap one."
 )
 
 
@@ -84,6 +90,7 @@ class ViewerApp:
         def _(client: viser.ClientHandle) -> None:
             client.camera.on_update(self.move)
             self.move(client.camera)
+            self._look(client)
 
     def open(self, name: str) -> None:
         """Show another result.
@@ -104,7 +111,7 @@ class ViewerApp:
             if scene.images:
                 self.select_frame(0)
             for client in self.server.get_clients().values():
-                self._look_home(client)
+                self._look(client)
 
     def update(self, _event: object = None) -> None:
         """Show what the panel says."""
@@ -115,6 +122,8 @@ class ViewerApp:
                 hidden_classes=frozenset(label for label, box in self.classes.items() if not box.value),
             )
             self._apply()
+            if self.voxel_panel is not None:
+                self.voxel_panel.visible = self.shown.voxels
             self.table.content = object_table(self.scene, self.shown)
             self._draw_frame()
 
@@ -130,6 +139,7 @@ class ViewerApp:
         with self._lock, self.server.atomic():
             self.object = None if index is None or index < 0 else index
             self.nodes.mark_object(self.object)
+            self._apply()
             chosen = 0 if self.object is None else self.object + 1
             self.choice.value = self.choice.options[chosen]  # type: ignore[misc]
             self.details.content = describe_object(self.scene, self.object)
@@ -139,6 +149,9 @@ class ViewerApp:
         with self._lock, self.server.atomic():
             self.frame = index
             self.nodes.mark_frame(index)
+            if self.nodes.backdrop not in (None, index):
+                for client in self.server.get_clients().values():
+                    self._look_from_frame(client)
             if self.frame_slider is not None and self.frame_slider.value != index:
                 self.frame_slider.value = index  # type: ignore[misc]
             self._draw_frame()
@@ -158,7 +171,8 @@ class ViewerApp:
                 center = volume.grid.lower.numpy() + (np.array(voxel) + 0.5) * size
                 self.nodes.mark_voxel(center, size, self.pixels)
                 self.reads.content = describe_reads(voxel, self.pixels, self.scene.frame_ids)
-            if self.pixels is not None and len(self.pixels.view):
+            # Who looks from a frame stays there, and the panel with the camera.
+            if self.pixels is not None and len(self.pixels.view) and self.nodes.backdrop is None:
                 self.select_frame(int(np.bincount(self.pixels.view, self.pixels.weight).argmax()))
             else:
                 self._draw_frame()
@@ -176,7 +190,15 @@ class ViewerApp:
         names = None
         if self._camera is not None:
             wanted = self.shown.objects(self.scene.objects)
-            names = names_with_room(self.nodes.name_points, self.nodes.names, self._camera, wanted)
+            points = self.nodes.name_points
+            if self.shown.meshes and wanted.any():
+                chosen = np.flatnonzero(wanted)
+                objects = self.scene.objects.select(torch.from_numpy(wanted))
+                wanted = wanted.copy()
+                wanted[chosen] = in_plain_sight(points[chosen], self._camera.position, objects)
+                if self.object in chosen:
+                    wanted[self.object] = True
+            names = names_with_room(points, self.nodes.texts, self._camera, wanted, self.object)
         self.nodes.apply(self.shown, names)
 
     def _draw_frame(self) -> None:
@@ -200,6 +222,7 @@ class ViewerApp:
         if len(self.scenes) > 1:
             choice = gui.add_dropdown("scene", tuple(self.scenes), initial_value=name)
             choice.on_update(self._open_chosen)
+        self._add_looks()
         with gui.add_folder("Show"):
             self.layers = {
                 layer: gui.add_checkbox(layer, getattr(Shown(), layer), visible=there.get(layer, True))
@@ -208,22 +231,27 @@ class ViewerApp:
             lowest = float(scene.objects.score.min()) if len(scene.objects) else 0.0
             lowest = min(float(np.floor(100 * lowest) / 100), 0.99)
             self.score = gui.add_slider("score ≥", lowest, 1.0, 0.01, lowest)
+        self.occupancy: viser.GuiSliderHandle[float] | None = None
+        self.voxel_panel: viser.GuiFolderHandle | None = None
+        if has_voxels:
+            self.voxel_panel = gui.add_folder("Voxels", visible=False)
+            with self.voxel_panel:
+                self._add_voxel_panel()
         labels = [scene.objects.label] if scene.truth is None else [scene.objects.label, scene.truth.label]
         with gui.add_folder("Classes", expand_by_default=False):
             self.classes = {
                 label: gui.add_checkbox(scene.objects.classes.names[label], True)
                 for label in sorted(set(torch.cat(labels).tolist()))
             }
-        self.occupancy: viser.GuiSliderHandle[float] | None = None
-        if has_voxels:
-            with gui.add_folder("Voxels", expand_by_default=False):
-                self._add_voxel_panel()
         self.frame_slider: viser.GuiSliderHandle[int] | None = None
         self.picture: viser.GuiImageHandle | None = None
         with gui.add_folder("Frame", visible=bool(scene.images)):
             if scene.images:
                 self._add_frame_panel()
-            self.reads = gui.add_markdown(_HOW_TO_READ, visible=any(v.reads for v in scene.volumes))
+            has_reads = any(v.reads for v in scene.volumes)
+            pick = gui.add_button("choose what to read by the next click or tap", visible=has_reads)
+            pick.on_click(self._pick)
+            self.reads = gui.add_markdown(_HOW_TO_READ, visible=has_reads)
         with gui.add_folder("Objects"):
             options = ("none", *(f"{i:02d} {name}" for i, name in enumerate(self.nodes.names)))
             self.choice = gui.add_dropdown("details of", options)
@@ -269,13 +297,23 @@ class ViewerApp:
             self.frame_slider = gui.add_slider("number", 0, count - 1, 1, 0)
             self.frame_slider.on_update(lambda event: self.select_frame(int(event.target.value)))
         self.picture = gui.add_image(self.scene.images[0], format="jpeg")
-        buttons = gui.add_button_group("camera", ("look from here", "see all"))
+        button = gui.add_button("look from here")
 
-        @buttons.on_click
-        def _(event: viser.GuiEvent[viser.GuiButtonGroupHandle]) -> None:
+        @button.on_click
+        def _(event: viser.GuiEvent[viser.GuiButtonHandle]) -> None:
             if event.client is not None:
-                look = self._look_home if event.target.value == "see all" else self._look_from_frame
-                look(event.client)
+                self._look_from_frame(event.client)
+
+    def _key_pressed(self, look: str, event: viser.CommandEvent) -> None:
+        self._look(event.client, look)
+
+    def _add_looks(self) -> None:
+        """Add buttons and keys that bring all of the scene into the picture."""
+        buttons = self.server.gui.add_button_group("look (F, T, N)", tuple(LOOKS))
+        buttons.on_click(lambda event: self._look(event.client, event.target.value))
+        for look, (key, meaning) in _KEYS.items():
+            command = self.server.gui.add_command(meaning, hotkey=key)  # type: ignore[arg-type]
+            command.on_trigger(partial(self._key_pressed, look))
 
     def _listen(self) -> None:
         """Have clicks on objects, frames and voxels choose them."""
@@ -294,8 +332,21 @@ class ViewerApp:
     def _clicked(self, event: viser.SceneClickEvent | viser.SceneNodePointerEvent[Any]) -> None:
         self.select_voxel_along(np.array(event.ray_origin), np.array(event.ray_direction))
 
-    def _look_home(self, client: viser.ClientHandle) -> None:
-        position, target = home(self.scene)
+    def _pick(self, _event: object) -> None:
+        """Have the next click anywhere choose what to read; a finger has no shift key."""
+
+        def picked(event: viser.SceneClickEvent) -> None:
+            self.server.scene.remove_click_callback(picked)
+            self._clicked(event)
+
+        self.server.scene.on_click()(picked)
+
+    def _look(self, client: viser.ClientHandle | None, look: str = "all") -> None:
+        """Have a browser's camera see all of the scene, from one of ``LOOKS``."""
+        if client is None:
+            return
+        # The panel takes some of a wide window after the first message.
+        position, target = home(self.scene, min(client.camera.aspect, 1.0), look)
         with client.atomic():
             client.camera.up_direction = (0.0, 0.0, 1.0)
             client.camera.position = position
@@ -373,8 +424,8 @@ def object_table(scene: ViewerScene, shown: Shown) -> str:
     for i in visible:
         name, score = scene.objects.category[i], float(scene.objects.score[i])
         error = scene.errors[i]
-        mark = "" if error is None else " ✓" if error.found else " ✗"
-        line = f"| {i:02d} {name}{mark} | {score:.2f} |"
+        sign = f" {mark(error)}" if with_errors else ""
+        line = f"| {i:02d} {name}{sign} | {score:.2f} |"
         if error is not None:
             line += f" {100 * error.translation:.1f} | {error.rotation:.0f} "
             line += f"| {error.scale:.0%} | {error.iou:.2f} |"
@@ -421,4 +472,7 @@ def describe_reads(voxel: tuple[int, int, int], pixels: ReadPixels | None, frame
     if not most:
         return f"voxel {voxel}: no ray passes through it."
     frames = int((share > 0).sum())
-    return f"voxel {voxel} read {len(pixels.view)} pixels of {frames} frames, most from {', '.join(most)}."
+    pixel = "1 pixel" if len(pixels.view) == 1 else f"{len(pixels.view)} pixels"
+    if frames == 1:
+        return f"voxel {voxel} read {pixel} of one frame, {most[0].rsplit(' ', 1)[0]}."
+    return f"voxel {voxel} read {pixel} of {frames} frames, most from {', '.join(most)}."

@@ -26,6 +26,15 @@ from raytran.viewer.truth import ObjectError
 FIELD_OF_VIEW = 0.87
 """Vertical, radians."""
 
+LOOKS = {"all": (-0.55, -0.85, 1.0), "top": (0.0, -1e-3, 1.0), "front": (0.0, -1.0, 0.0)}
+"""Where a camera stands that sees all of a scene, from its middle; from the top north (+y) is up."""
+
+_FILLED = 0.9
+"""Share of the picture that a scene may fill."""
+
+_NEAREST = 0.7
+"""Least distance of a camera that sees all of a scene from the scene, metres."""
+
 Floats = NDArray[np.float64]
 Pixels = NDArray[np.uint8]
 
@@ -85,6 +94,8 @@ class SceneNodes:
 
     Attributes:
         objects: nodes of each object.
+        names, texts: class and score of each object, and what its name in the scene says.
+        backdrop: frame whose picture is behind everything, or None.
         truth: dashed edges of each true object.
         frames: frusta by frame number: all, or those of an export.
         voxels: cubes of the occupied voxels of the whole volume, or None.
@@ -99,7 +110,8 @@ class SceneNodes:
     def __init__(self, server: viser.ViserServer, scene: ViewerScene, *, export: bool = False) -> None:
         self._server, self._scene, self._export = server, scene, export
         self._shown = Shown()
-        self._backdrop: int | None = None
+        self._names: NDArray[np.bool_] | None = None
+        self.backdrop: int | None = None
         self._is_there = False
         server.scene.reset()
         server.scene.set_up_direction("+z")
@@ -111,6 +123,7 @@ class SceneNodes:
         corners = box_corners(scene.objects).double().numpy()
         self.name_points = corners.max(axis=1) * (0, 0, 1) + scene.objects.center.numpy() * (1, 1, 0)
         self.names = [object_name(scene, i) for i in range(len(corners))]
+        self.texts = [self._text(i) for i in range(len(corners))]
         meshes = _coarser(scene.meshes) if export else scene.meshes
         self.objects = [self._add_object(i, corners[i], meshes[i]) for i in range(len(corners))]
         self.truth = self._add_truth()
@@ -130,7 +143,7 @@ class SceneNodes:
             shown: what is to be seen.
             names: ``(M,)`` whether an object's name has room on the screen; None: all have.
         """
-        self._shown = shown
+        self._shown, self._names = shown, names
         visible = shown.objects(self._scene.objects)
         for i, nodes in enumerate(self.objects):
             has_mesh = isinstance(nodes.solid, viser.MeshHandle)
@@ -140,8 +153,9 @@ class SceneNodes:
         if self._scene.truth is not None:
             for label, node in zip(self._scene.truth.label.tolist(), self.truth, strict=True):
                 node.visible = shown.truth and label not in shown.hidden_classes
-        for frustum in self.frames.values():
-            frustum.visible = shown.frames
+        for n, frustum in self.frames.items():
+            # Pictures of cameras near by would stand in the way of a look from a frame.
+            frustum.visible = shown.frames if self.backdrop is None else n == self.backdrop
         if self.voxels is not None:
             self.voxels.visible = shown.voxels
         self._grid.visible = self._server.scene.world_axes.visible = shown.grid
@@ -163,13 +177,14 @@ class SceneNodes:
         for n, frustum in self.frames.items():
             depth = _BACKDROP_DEPTH if n == index else _FRUSTUM_DEPTH
             frustum.scale = depth / frustum.compute_canonical_frustum_size()[2]
-        self._backdrop, self._is_there = index, False
+        self.backdrop, self._is_there = index, False
+        self.apply(self._shown, self._names)
 
     def leave_backdrop(self, position: Floats) -> None:
         """Put the picture back when a camera, now at ``position`` ``(3,)``, has left the frame's place."""
-        if self._backdrop is None:
+        if self.backdrop is None:
             return
-        away = float(np.linalg.norm(self._scene.cameras.position[self._backdrop].numpy() - position))
+        away = float(np.linalg.norm(self._scene.cameras.position[self.backdrop].numpy() - position))
         if away < _AWAY:
             self._is_there = True
         elif self._is_there:  # else the message is from before the camera came
@@ -270,17 +285,20 @@ class SceneNodes:
         )
 
     def _add_name(self, path: str, index: int) -> viser.LabelHandle:
-        text, error = self.names[index], self._scene.errors[index]
-        if self._export and error is not None:
-            text += describe_error(error)
         return self._server.scene.add_label(
             path,
-            text,
+            self.texts[index],
             position=self.name_points[index],
             font_size_mode="scene" if self._export else "screen",
             font_scene_height=0.09,
             anchor="bottom-center",
         )
+
+    def _text(self, index: int) -> str:
+        text, error = self.names[index], self._scene.errors[index]
+        if error is None:
+            return text if self._scene.truth is None else f"{text} {mark(None)}"
+        return f"{text} {mark(error)}" + (f"\n{describe_error(error)}" if self._export else "")
 
     def _add_truth(self) -> list[viser.LineSegmentsHandle]:
         if self._scene.truth is None:
@@ -352,19 +370,40 @@ def object_name(scene: ViewerScene, index: int) -> str:
     return f"{scene.objects.category[index]} {float(scene.objects.score[index]):.2f}"
 
 
+def mark(error: ObjectError | None) -> str:
+    """Return the sign of an object that is found, or that is not; colours alone would not tell everybody."""
+    return "✓" if error is not None and error.found else "✗"
+
+
 def describe_error(error: ObjectError) -> str:
-    """Return whether an object is found and how far it is off, in a few words for the end of its name."""
-    return f"{' ✓' if error.found else ' ✗'}\n{100 * error.translation:.0f} cm, {error.rotation:.0f}°"
+    """Return how far an object is off, in a few words."""
+    return f"{100 * error.translation:.0f} cm, {error.rotation:.0f}°"
 
 
-def home(scene: ViewerScene) -> tuple[Floats, Floats]:
-    """Return a camera's position and target from which all of the scene is in the picture, ``(3,)`` each."""
+def home(scene: ViewerScene, aspect: float = 1.0, look: str = "all") -> tuple[Floats, Floats]:
+    """Return a camera's position and target from which the scene fills the picture, ``(3,)`` each.
+
+    Args:
+        scene: the result.
+        aspect: width of the picture over its height.
+        look: one of ``LOOKS``.
+    """
     points = _extremes(scene)
-    target = (points.min(axis=0) + points.max(axis=0)) / 2
-    radius = max(float(np.linalg.norm(points - target, axis=1).max()), 0.5)
-    direction = np.array([-0.55, -0.85, 1.0])
-    distance = radius / np.sin(FIELD_OF_VIEW / 2)
-    return target + direction / np.linalg.norm(direction) * distance, target
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    back = np.array(LOOKS[look])
+    back = back / np.linalg.norm(back)
+    right = np.cross([0.0, 0.0, 1.0], back)
+    right = right / np.linalg.norm(right)
+    along = (points - middle) @ np.stack([right, np.cross(back, right), back], axis=1)
+    # A point is in the picture if |x - cx| <= t (distance - z); of each axis the tightest pair decides.
+    needed, center = [_NEAREST + float(along[:, 2].max())], np.zeros(2)
+    for axis, tangent in enumerate(_FILLED * np.tan(FIELD_OF_VIEW / 2) * np.array([aspect, 1.0])):
+        high = float((along[:, axis] + tangent * along[:, 2]).max())
+        low = float((-along[:, axis] + tangent * along[:, 2]).max())
+        needed.append((high + low) / (2 * tangent))
+        center[axis] = (high - low) / 2
+    target = middle + center[0] * right + center[1] * np.cross(back, right)
+    return target + back * max(needed), target
 
 
 def _extremes(scene: ViewerScene) -> Floats:
@@ -412,7 +451,11 @@ def draw_reads(image: Pixels, pixels: ReadPixels, frame: int) -> Pixels:
 
 
 def names_with_room(
-    points: Floats, names: Sequence[str], camera: viser.CameraHandle, wanted: NDArray[np.bool_]
+    points: Floats,
+    names: Sequence[str],
+    camera: viser.CameraHandle,
+    wanted: NDArray[np.bool_],
+    first: int | None = None,
 ) -> NDArray[np.bool_]:
     """Return which names are shown so that none covers a surer object's, ``(M,)``.
 
@@ -421,6 +464,7 @@ def names_with_room(
         names: of the objects, surest first.
         camera: of a browser.
         wanted: ``(M,)`` names that there are; the others take no room.
+        first: number of the object whose name is shown before all others, or None.
     """
     height, width = camera.image_height, camera.image_width
     in_camera = (points - camera.position) @ SO3(camera.wxyz).as_matrix()
@@ -430,10 +474,33 @@ def names_with_room(
     middle = in_camera[:, :2] / depth * focal + (width / 2, height / 2)
     half = np.array([[0.33 * _EM * len(name), 0.8 * _EM] for name in names]).reshape(-1, 2)
     shown = np.zeros(len(names), dtype=bool)
-    for i in np.flatnonzero(wanted & ahead):
+    in_turn = sorted(np.flatnonzero(wanted & ahead).tolist(), key=lambda i: i != first)
+    for i in in_turn:
         apart = np.abs(middle[i] - middle[shown]) > half[i] + half[shown]
         shown[i] = bool(apart.any(axis=1).all())
     return shown
+
+
+def in_plain_sight(points: Floats, eye: Floats, objects: ObjectSet) -> NDArray[np.bool_]:
+    """Return which points no box of another object hides, ``(M,)``; a box hides nothing inside of it.
+
+    Args:
+        points: ``(M, 3)``, one above each object.
+        eye: ``(3,)`` place of the camera.
+        objects: the ``M`` objects.
+    """
+    turn, half = objects.rotation.double().numpy(), objects.size.double().numpy() / 2
+    center = objects.center.double().numpy()
+    # Boxes in rows, points in columns, along the axes of each box.
+    start = np.einsum("bij,bi->bj", turn, eye - center)[:, None]
+    stop = np.einsum("bij,bpi->bpj", turn, points - center[:, None])
+    way = stop - start
+    way = np.where(np.abs(way) < 1e-9, 1e-9, way)
+    enter, leave = np.sort([(-half[:, None] - start) / way, (half[:, None] - start) / way], axis=0)
+    enter, leave = enter.max(axis=2, initial=-np.inf), leave.min(axis=2, initial=np.inf)
+    hides = (enter < leave) & (enter > 0) & (leave < 1)
+    np.fill_diagonal(hides, False)
+    return np.asarray(~hides.any(axis=0))
 
 
 def _smaller(image: Pixels, side: int) -> Pixels:

@@ -15,10 +15,10 @@ import rich
 import viser
 
 from raytran.errors import ConfigError
+from raytran.viewer import HTML
 from raytran.viewer.data import read_viewer_scene
 from raytran.viewer.scene import SceneNodes
 
-HTML = "prediction.html"
 FIRST_PORT = 8765
 _PORTS_TRIED = 20
 

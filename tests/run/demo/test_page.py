@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import pytest
 import torch
@@ -14,6 +15,7 @@ from raytran.run.demo.page import ShownScene, headline, write_page
 from raytran.run.predict.write_scene import PredictedScene, write_scene
 from raytran.run.train.fit import FitResult
 from raytran.structs import ObjectSet, SceneBatch, ScenePrediction, Views
+from raytran.viewer import HTML
 
 UPRIGHT = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 
@@ -33,7 +35,7 @@ class Page(HTMLParser):
         values = dict(attrs)
         self.sources += [values["src"]] if "src" in values else []
         self.links += [values["href"]] if "href" in values else []
-        if tag not in ("meta", "img", "br"):
+        if tag not in ("meta", "img", "br", "wbr"):
             self.open.append(tag)
 
     def handle_endtag(self, tag):
@@ -58,6 +60,7 @@ def metrics(n_good: int) -> dict:
     return {
         "strict": {"per_class": per_class, "per_threshold": thresholds, **total},
         "occupancy_iou": 0.25,
+        "num_views": 12,
     }
 
 
@@ -90,6 +93,8 @@ def scene(split: str, scene_id: str, output) -> ShownScene:
     extent = (6.0, 6.0, 3.0)
     found = PredictedScene(prediction, [None])
     write_scene(folder, found, views, batch.frame_id[0], turntable=0, truth=objects)
+    if split == "train":
+        (folder / HTML).touch()
     return ShownScene(split, folder, batch, prediction, extent)
 
 
@@ -105,20 +110,25 @@ def test_headline():
     assert headline(metrics(0) | {"shape": {"iou": None}})["shape IoU"] == "–"
 
 
-@pytest.fixture
-def page(tmp_path) -> str:
-    logs = tmp_path / "training" / "stage1"
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("demo")
+
+
+@pytest.fixture(scope="module")
+def page(folder) -> str:
+    logs = folder / "training" / "stage1"
     logs.mkdir(parents=True)
     (logs / "metrics.csv").write_text("epoch,step,train/total\n0,1,2.0\n0,2,1.0\n")
     fit = FitResult(logs, logs / "checkpoints" / "last.ckpt", 2, 1.0, {})
     path = write_page(
-        tmp_path,
-        scenes=[scene("train", "scene0000_00", tmp_path), scene("val", "scene0001_00", tmp_path)],
+        folder,
+        scenes=[scene("train", "scene0000_00", folder), scene("val", "scene0001_00", folder)],
         metrics={"train": metrics(5), "val": metrics(1)},
         fits=[fit],
         seconds={"rooms": 9.96, "training": 125.0},
     )
-    assert path == tmp_path / "index.html"
+    assert path == folder / "index.html"
     return re.sub(r"data:[^\"]+", "data:", path.read_text())
 
 
@@ -130,10 +140,10 @@ def test_splits_are_told_apart(page):
     assert "A held-out room: scene0001_00" in page
 
 
-def test_pictures_and_files_are_there(page, tmp_path):
+def test_pictures_and_files_are_there(page, folder):
     assert page.count('src="data:"') == 2 * 5 + 1
     assert 'href="predictions/scene0001_00/scene.glb"' in page
-    assert (tmp_path / "predictions" / "scene0001_00" / "scene.glb").is_file()
+    assert (folder / "predictions" / "scene0001_00" / "scene.glb").is_file()
     assert 'href="training/stage1/checkpoints/last.ckpt"' in page
 
 
@@ -148,3 +158,33 @@ def test_the_page_says_everything_and_closes_its_tags(page):
     assert "all 2 min 15 s" in flat
     assert "bathtub" not in flat, "a class that occurs nowhere has no row"
     assert set(parsed.sources) == {"data:"}, "it stands alone"
+
+
+def test_one_object_is_one_and_the_frames_are_counted(page):
+    flat = re.sub(r"\s+", " ", Page(page).text)
+    assert "1 object was predicted, 1 is there." in flat
+    assert "12 of each room" in flat
+
+
+def test_a_room_can_be_looked_at_in_3d(page, folder):
+    links = Page(page).links
+    assert "predictions/scene0000_00/prediction.html" in links
+    assert "predictions/scene0001_00/prediction.html" not in links, "no link to what is not there"
+    assert not any(link.endswith(".gif") for link in links)
+    assert f"raytran view {folder / 'predictions'}</code>" in page
+
+
+def test_long_names_of_files_break_between_folders_alone(page):
+    (files,) = re.findall(r'<dl class="card files">(.*?)</dl>', page, flags=re.DOTALL)
+    assert "predictions/<wbr>scene0000_00/<wbr>scene.glb</code>" in files
+    # A cell that breaks anywhere beside one that never does is one letter wide on a phone.
+    style = page[page.index("<style>") : page.index("</style>")]
+    assert "anywhere" not in re.search(r"dl\.files dd \{[^}]*\}", style).group()
+
+
+def test_plots_are_dark_in_the_dark_and_do_not_shrink(page):
+    assert page.count('<img class="plot"') == 2 * 2 + 1, "plan and layers of two rooms, and the curves"
+    style = re.sub(r"\s+", " ", page)
+    dark = style[style.index("{ /* Black ink") :]
+    assert "img.plot { background: #fff; filter: invert(" in dark[:300]
+    assert re.search(r"\.plot \{ min-width: \d+rem; \}", style)

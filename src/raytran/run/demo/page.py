@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,7 @@ from raytran.pictures.panels import contact_sheet, draw_frames, draw_masks, draw
 from raytran.run.train.fit import FitResult
 from raytran.structs import SceneBatch, ScenePrediction
 from raytran.training.history import read_history
+from raytran.viewer import HTML
 
 COLUMNS = {
     "train": "training rooms",
@@ -31,6 +33,9 @@ COLUMNS = {
 """What was asked → what a reader is told it is, in the order of the page."""
 
 _MEDIA = {".png": "image/png", ".jpg": "image/jpeg"}
+_TO_LOOK_AT = {HTML: "walk around in 3D", "turntable.gif": "one turn around the objects (GIF)"}
+"""Files of a room that are too large for the page → what a link to them says."""
+
 _STAGES = {"stage1": "1 · occupancy", "stage2": "2 · all but shape", "stage3": "3 · shape"}
 
 
@@ -108,18 +113,27 @@ def write_page(
         summary="Rooms were generated, a small network was trained from scratch through the three stages of "
         f"the paper, and then asked for the objects of the {_scenes(metrics, 'train')} training rooms and of "
         f"{_scenes(metrics, 'val')} held-out ones: class, position, size, heading and mesh, from posed "
-        "frames alone.",
+        f"frames alone, {_frames(metrics)} of each room. From other frames, or from more of them, the "
+        "numbers are others.",
         splits=splits,
-        sections=[*(_room(scene, output / "pictures") for scene in scenes), _training(output, fits)],
+        sections=[*(_room(scene, output) for scene in scenes), _training(output, fits)],
+        view=f"raytran view {shlex.quote(str(output / 'predictions'))}",
         classes=[(name, colors.get(name, INK)) for name in classes],
         seconds=seconds,
-        files={name: os.path.relpath(path, output) for name, path in files.items()},
+        files={name: _relative(path, output) for name, path in files.items()},
         versions={**found["versions"], **commit, "platform": found["platform"]},
     )
 
 
 def _scenes(metrics: Mapping[str, Mapping[str, Any]], column: str) -> int:
     return metrics[column]["strict"]["n_scenes"]
+
+
+def _frames(metrics: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return how many frames of a room the networks were given; all columns have the same number."""
+    return " or ".join(
+        str(count) for count in dict.fromkeys(entry["num_views"] for entry in metrics.values())
+    )
 
 
 def _split(column: str, metrics: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
@@ -154,16 +168,17 @@ def _training(output: Path, fits: Sequence[FitResult]) -> dict[str, Any]:
         "text": f"Three fits, one after another, of {steps} steps, each until the training rooms are learned "
         "or its steps used up: first what is occupied, then everything but the shapes, then the shapes alone "
         "while the rest is frozen.",
+        "links": [],
         "pictures": [
-            _picture(curves, "Terms of the loss against steps: running mean and single values.", wide=True)
+            _plot(curves, "Terms of the loss against steps: running mean and single values.", wide=True)
         ],
     }
 
 
-def _room(scene: ShownScene, pictures: Path) -> dict[str, Any]:
+def _room(scene: ShownScene, output: Path) -> dict[str, Any]:
     """Return the section of a room: what ``write_scene`` drew, and the network's input and output."""
     batch, prediction = scene.batch, scene.prediction
-    folder = pictures / scene.column
+    folder = output / "pictures" / scene.column
     folder.mkdir(parents=True, exist_ok=True)
     in_order = dict.fromkeys(scene.folder / "overlays" / f"{name}.jpg" for name in batch.frame_id[0])
     overlays = [
@@ -172,7 +187,7 @@ def _room(scene: ShownScene, pictures: Path) -> dict[str, Any]:
         if path.is_file()
     ]
     shown = [
-        _picture(
+        _plot(
             scene.folder / "topdown.png", "From above. Filled: predicted; dashed: true; arrow heads: fronts."
         ),
         _picture(
@@ -194,19 +209,37 @@ def _room(scene: ShownScene, pictures: Path) -> dict[str, Any]:
         truth = None if batch.occupancy is None else batch.occupancy[0]
         height = scene.grid_extent[2]
         slices = draw_occupancy(folder / "occupancy.png", prediction.occupancy, truth, height=height)
-        shown.append(_picture(slices, "Occupied voxels in four layers; heights count from the mean camera."))
+        shown.append(_plot(slices, "Occupied voxels in four layers; heights count from the mean camera."))
     count = 0 if batch.objects is None else len(batch.objects[0])
     kind = "training" if scene.column == "train" else "held-out"
     by = ", by raytran's own weights" if scene.column == "shipped" else ""
     return {
         "title": f"A {kind} room{by}: {prediction.scene_id}",
-        "text": f"{len(prediction.objects)} objects were predicted, {count} are there.",
+        "text": f"{_were(len(prediction.objects))} predicted, {count} {'is' if count == 1 else 'are'} there.",
         "pictures": shown,
+        "links": [
+            (text, _relative(scene.folder / name, output))
+            for name, text in _TO_LOOK_AT.items()
+            if (scene.folder / name).is_file()
+        ],
     }
 
 
+def _were(count: int) -> str:
+    return "1 object was" if count == 1 else f"{count} objects were"
+
+
 def _picture(path: Path, caption: str, *, wide: bool = False) -> dict[str, Any]:
-    return {"path": path, "caption": caption, "wide": wide}
+    return {"path": path, "caption": caption, "wide": wide, "plot": False}
+
+
+def _plot(path: Path, caption: str, *, wide: bool = False) -> dict[str, Any]:
+    """Return a picture with text on white paper, which is not to shrink and in the dark not to shine."""
+    return _picture(path, caption, wide=wide) | {"plot": True}
+
+
+def _relative(path: Path, output: Path) -> str:
+    return Path(os.path.relpath(path, output)).as_posix()
 
 
 def _files(output: Path, scenes: Sequence[ShownScene], fits: Sequence[FitResult]) -> dict[str, Path]:
