@@ -46,14 +46,14 @@ class Trial:
     Attributes:
         checkpoint: as the commands take it.
         num_views: frames of a room.
-        score_threshold: least score of an object that counts.
+        score_threshold: least score of an object that counts, None for the network's own.
         scenes: rooms of each set, None for all.
         folder: for what the commands write.
     """
 
     checkpoint: str
     num_views: int
-    score_threshold: float
+    score_threshold: float | None
     scenes: int | None
     folder: Path
 
@@ -186,18 +186,22 @@ def _evaluated(trial: Trial, root: Path, name: str) -> dict[str, Any]:
     few = [] if trial.scenes is None else [f"max_scenes={trial.scenes}"]
     run(
         *("evaluate", f"checkpoint={trial.checkpoint}", "data=scan2cad", f"data.root={root}", "split=test"),
-        *(f"num_views={trial.num_views}", f"score_threshold={trial.score_threshold}", *few),
+        *(f"num_views={trial.num_views}", *_threshold(trial), *few),
         f"output={output}",
     )
     metrics: dict[str, Any] = json.loads((output / "metrics.json").read_text())
     return metrics
 
 
+def _threshold(trial: Trial) -> list[str]:
+    return [] if trial.score_threshold is None else [f"score_threshold={trial.score_threshold}"]
+
+
 def _predict(trial: Trial, scene: Path, output: Path) -> None:
     """Predict a video as a user would, without the pictures."""
     run(
         *("predict", f"checkpoint={trial.checkpoint}", f"scene={scene}", f"output={output}"),
-        *(f"score_threshold={trial.score_threshold}", "viewer=false", "turntable=0", "num_overlays=0"),
+        *(*_threshold(trial), "viewer=false", "turntable=0", "num_overlays=0"),
     )
 
 
@@ -243,7 +247,7 @@ def main() -> None:
     parser.add_argument("--scan", type=Path, help="(c) folder with scannet/scans and scan2cad")
     parser.add_argument("--lounge", type=Path, help="(d) folder with one scan in scans, and boxes.json")
     parser.add_argument("--num-views", type=int, default=24, help="frames of a room")
-    parser.add_argument("--score-threshold", type=float, default=0.5)
+    parser.add_argument("--score-threshold", type=float, help="else the network's own")
     parser.add_argument("--scenes", type=int, help="only the first rooms of each set, for a quick look")
     parser.add_argument("--table", type=Path, default=HERE / "real.csv", help="file that keeps the rows")
     parser.add_argument("--output", type=Path, help="folder that keeps what the commands write")
@@ -260,7 +264,7 @@ def main() -> None:
             figures = measured(Trial(checkpoint, *how, folder=kept), folders)
         if not figures:
             raise SystemExit("nothing to measure on: give at least one folder")
-        key = dict(zip(KEY, (sha256, how[0], how[1], how[2] or "all"), strict=True))
+        key = dict(zip(KEY, (sha256, how[0], how[1] or "own", how[2] or "all"), strict=True))
         date_commit = {"date": circumstances()["date"], "commit": circumstances()["commit"]}
         lost = keep_row(arguments.table, {"name": name, **key, **date_commit, **figures})
         if lost:

@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 
 from raytran.classes import Classes
 from raytran.errors import ConfigError
-from raytran.postprocess import DUPLICATE_IOU, SCORE_THRESHOLD
+from raytran.postprocess import DUPLICATE_IOU
 from raytran.rooms.generate import generate_rooms
 from raytran.run.entry import compose
 from raytran.run.train.build import build_model, plain
@@ -154,7 +154,7 @@ def test_the_papers_preset_is_the_default_of_the_code():
 def test_commands_count_the_objects_that_the_code_counts(command):
     typed = {"evaluate": [], "predict": ["scene=a", "output=b"], "demo": []}[command]
     cfg = compose(command, typed)
-    assert (cfg.score_threshold, cfg.duplicate_iou) == (SCORE_THRESHOLD, DUPLICATE_IOU)
+    assert (cfg.score_threshold, cfg.duplicate_iou) == (None, DUPLICATE_IOU)
 
 
 def test_the_papers_numbers():

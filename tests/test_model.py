@@ -12,6 +12,7 @@ from raytran.extensions.denoising import DenoisingLoss
 from raytran.geometry.camera import Cameras
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.rotation import yaw_from_rotation
+from raytran.heads.score_scaling import ScoreScaling
 from raytran.losses.matcher import HungarianMatcher
 from raytran.losses.total import TotalLoss
 from raytran.model import TASKS
@@ -190,6 +191,16 @@ def test_decode() -> None:
     torch.testing.assert_close(yaw_from_rotation(objects.rotation), torch.full((2,), math.pi / 2))
     assert objects.shape.shape == (2, 63, 63, 63)
     torch.testing.assert_close(prediction.occupancy, torch.full((2, 2, 2), 0.5))
+
+
+def test_scaled_scores_choose_the_same_objects_by_their_own_threshold() -> None:
+    model, raw = make_model(), raw_with([0.2, 0.9, 0.49, 0.51])
+    assert model.score_threshold == 0.5
+    model.score_scaling = ScoreScaling(0.8, -2.0)
+    assert model.score_threshold == pytest.approx(1 / (1 + math.exp(2.0)))
+    (found,) = model.decode(raw, ["scene"], score_threshold=model.score_threshold, with_shapes=False)
+    assert found.objects.label.tolist() == [1, 3]
+    assert len(model.decode(raw, ["scene"], score_threshold=0.5, with_shapes=False)[0].objects) == 0
 
 
 def test_decode_of_nothing_and_without_shapes() -> None:

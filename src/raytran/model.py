@@ -22,7 +22,7 @@ from raytran.geometry.camera import Cameras
 from raytran.geometry.checks import check_views
 from raytran.geometry.grid import VoxelGrid, checked_grid
 from raytran.heads.objects import ObjectOutputs, objects_of_queries
-from raytran.heads.score_scaling import ScoreScaling
+from raytran.heads.score_scaling import SCORE_THRESHOLD, ScoreScaling
 from raytran.ops.pairs import Pairs
 from raytran.ops.traverse import Attention, RayTracer, count_views
 from raytran.setting_limits import check_settings
@@ -292,6 +292,16 @@ class RayTran(nn.Module):
         heads = tuple(f"heads.{name}" for name in self.heads if name not in tasks)
         idle = self.backbone.idle_modules(with_pixels="foreground" in tasks)
         return heads + tuple(f"backbone.{name}" for name in idle)
+
+    @property
+    def score_threshold(self) -> float:
+        """The score of an object to which the network gave a probability of ½: from there on objects count.
+
+        Where scores are scaled it is another number and chooses the same objects.
+        """
+        if self.score_scaling is None:
+            return SCORE_THRESHOLD
+        return float(self.score_scaling(torch.tensor(SCORE_THRESHOLD, dtype=torch.float64)))
 
     @torch.no_grad()
     def predict(

@@ -17,11 +17,9 @@ from torch import Tensor
 from raytran.geometry.boxes import OrientedBoxes, box_iou
 from raytran.geometry.grid import VoxelGrid
 from raytran.geometry.room_tiles import Volumes
+from raytran.heads.score_scaling import SCORE_THRESHOLD
 from raytran.setting_limits import check_settings
 from raytran.structs import ObjectSet, ScenePrediction
-
-SCORE_THRESHOLD = 0.5
-"""Least score of an object that counts as predicted, unless another is asked for."""
 
 DUPLICATE_IOU = 0.25
 """Of two objects of one class whose boxes overlap more, the one with the lower score does not count."""

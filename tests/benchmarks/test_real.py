@@ -111,21 +111,23 @@ def test_a_row_has_all_cases_and_is_replaced(commands, folders, tmp_path, monkey
     table = tmp_path / "real.csv"
     (row,) = measure(monkeypatch, table, folders, "--scenes", "3")
     assert row["sha256"] == file_digest(checkpoint_path("default"))[:12]
-    assert (row["scenes"], row["num_views"], row["score_threshold"]) == ("3", "24", "0.5")
+    assert (row["scenes"], row["num_views"], row["score_threshold"]) == ("3", "24", "own")
     assert (row["rooms_accuracy"], row["rooms_shape_iou"], row["rooms_chair_iou"]) == ("0.5", "0.4", "0.2")
     assert (row["furniture_calibration"], row["furniture_calibration_every"]) == ("0.2", "0.1")
     assert row["furniture_given_accuracy"] == "1.0"
     assert (row["scan_f1"], row["scan_in_nothing"]) == ("0.6", "2")
     assert (row["lounge_right"], row["lounge_true"], row["lounge_predicted"]) == ("2", "2", "3")
     of_rooms = next(words for words in commands if f"data.root={folders['rooms']}" in words)
-    assert {"split=test", "num_views=24", "score_threshold=0.5", "max_scenes=3"} <= set(of_rooms)
+    assert {"split=test", "num_views=24", "max_scenes=3"} <= set(of_rooms)
+    assert not any(word.startswith("score_threshold") for words in commands for word in words)
     page = table.with_suffix(".md").read_text()
     assert "| default | 50.0 % | 0.600 | 7 | 9 | 0.400 | 5.0 cm | 0.200 | 4.0 cm |" in page
 
     again = measure(monkeypatch, table, folders, "--scenes", "3", "--names", "shipped")
     assert [one["name"] for one in again] == ["shipped"]
-    assert len(measure(monkeypatch, table, folders, "--num-views", "5")) == 2
+    assert len(measure(monkeypatch, table, folders, "--num-views", "5", "--score-threshold", "0.3")) == 2
     assert "max_scenes=3" not in commands[-4]
+    assert "score_threshold=0.3" in commands[-4]
     capsys.readouterr()
 
 

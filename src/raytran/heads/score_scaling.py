@@ -12,6 +12,9 @@ from torch import Tensor
 from raytran.errors import ConfigError, DataError
 from raytran.limits import LOG_ODDS, SCALE, as_number
 
+SCORE_THRESHOLD = 0.5
+"""Least probability of an object that counts, unless another one is asked for."""
+
 
 @dataclass(frozen=True)
 class ScoreScaling:

@@ -11,6 +11,7 @@ from torch import nn
 from torchmetrics import Metric
 
 from raytran.classes import PAPER_CLASSES, Classes
+from raytran.heads.score_scaling import SCORE_THRESHOLD
 from raytran.metrics.average_precision import MeanAveragePrecision, threshold_name
 from raytran.metrics.box_f1 import OrientedBoxF1
 from raytran.metrics.new_views import NewViewScores
@@ -19,7 +20,7 @@ from raytran.metrics.per_scene import Row
 from raytran.metrics.score_calibration import ScoreCalibration
 from raytran.metrics.shape import MatchedShapeScores
 from raytran.metrics.strict import StrictScores, side_by_side
-from raytran.postprocess import DUPLICATE_IOU, SCORE_THRESHOLD, select_objects
+from raytran.postprocess import DUPLICATE_IOU, select_objects
 from raytran.structs import ObjectSet, SceneBatch, ScenePrediction
 
 _OF_ALL_SCORES = ("best", "average_precision", "mean_average_precision")

@@ -26,6 +26,7 @@ class Oracle(nn.Module):
 
     grid_extent = (20.0, 20.0, 5.0)
     classes = PAPER_CLASSES
+    score_threshold = 0.5
 
     def __init__(self, objects: ObjectSet) -> None:
         super().__init__()

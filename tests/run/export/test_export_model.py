@@ -250,8 +250,11 @@ def test_what_evaluate_wrote_of_the_shipped_weights_leaves_nothing_to_scale_ther
     def calibration(checkpoint, name):
         done = command("evaluate", f"checkpoint={checkpoint}", *words, f"output={name}", folder=tmp_path)
         assert done.returncode == 0, done.stderr
-        return json.loads((tmp_path / name / "metrics.json").read_text())["strict"]["calibration"]
+        strict = json.loads((tmp_path / name / "metrics.json").read_text())["strict"]
+        counted.append(strict["per_threshold"]["0.25"]["n_predicted"])
+        return strict["calibration"]
 
+    counted: list[int] = []
     before = calibration("default", "before")
     scaled = ["checkpoint=default", "output=scaled.safetensors", "calibration=before"]
     done = command("export_model", *scaled, folder=tmp_path)
@@ -260,6 +263,8 @@ def test_what_evaluate_wrote_of_the_shipped_weights_leaves_nothing_to_scale_ther
     assert before["every_score"]["n_right"] > 0
     assert before["every_score"]["scaling"] != pytest.approx({"scale": 1.0, "offset": 0.0}, abs=0.1)
     assert after["every_score"]["scaling"] == pytest.approx({"scale": 1.0, "offset": 0.0}, abs=0.02)
+    # What a score says has changed, not what counts as found.
+    assert counted[0] == counted[1] > 0
 
 
 def test_a_card_says_what_the_weights_are_and_how_to_load_them(trained, tmp_path):

@@ -41,6 +41,7 @@ class Oracle(nn.Module):
     grid_extent = (8.0, 8.0, 4.0)
     grid_resolution = (4, 4, 2)
     classes = PAPER_CLASSES
+    score_threshold = 0.5
 
     def __init__(self) -> None:
         super().__init__()

@@ -27,7 +27,7 @@ from raytran.data.views import RepeatedFrames
 from raytran.errors import ConfigError
 from raytran.geometry.camera import Cameras
 from raytran.model import RayTran
-from raytran.postprocess import DUPLICATE_IOU, SCORE_THRESHOLD
+from raytran.postprocess import DUPLICATE_IOU
 from raytran.run.device import choose_device, device_name, set_matmul_precision
 from raytran.run.entry import compose, typed_settings
 from raytran.run.evaluate.results import MAP, MARKER, Evaluation, read_curves, result_tables, write_evaluation
@@ -241,7 +241,7 @@ def evaluate_model(
     dataset: Dataset[SceneBatch],
     *,
     tasks: Collection[str] = TASKS,
-    score_threshold: float = SCORE_THRESHOLD,
+    score_threshold: float | None = None,
     duplicate_iou: float | None = DUPLICATE_IOU,
     views_at_once: int | None = None,
     num_resamples: int = 2000,
@@ -258,7 +258,8 @@ def evaluate_model(
         dataset: scenes with targets, each a ``SceneBatch`` with B = 1.
         tasks: what to compare: ``TASKS``; with the shapes of the objects found ``TASKS_WITH_SHAPE``, for
             which the scenes must have shapes; or ``view`` alone, for which they must have ``new_views``.
-        score_threshold: objects with a lower score do not count as predicted.
+        score_threshold: objects with a lower score do not count as predicted; None: the network's own, see
+            ``RayTran.score_threshold``.
         duplicate_iou: nor does one that overlaps a surer one of its class by more than this IoU.
         views_at_once: frames that pass through the network together, None for all.
         num_resamples: draws of the bootstrap.
@@ -277,6 +278,7 @@ def evaluate_model(
         ``NewViewScores`` does, each of ``metrics`` by its name, and what ``about`` says.
     """
     device = next(model.parameters()).device
+    score_threshold = model.score_threshold if score_threshold is None else score_threshold
     scores = SceneScores(
         tasks=tasks,
         score_threshold=score_threshold,

@@ -173,7 +173,7 @@ def predict_scene(
     room: RoomViews,
     *,
     scene_id: str,
-    score_threshold: float,
+    score_threshold: float | None,
     duplicate_iou: float | None,
     views_at_once: int | None = None,
     with_shapes: bool = True,
@@ -186,7 +186,8 @@ def predict_scene(
         model: the network, on any device.
         room: frames and volumes.
         scene_id: name to give the result.
-        score_threshold: objects with a lower score are left out.
+        score_threshold: objects with a lower score are left out; None: the network's own threshold counts,
+            ``RayTran.score_threshold``.
         duplicate_iou: of two objects of a class with a higher box IoU, the weaker is left out; None: neither.
         views_at_once: frames that pass through the network together, None for all; fewer need less memory.
         with_shapes: decode the objects' shapes.
@@ -219,7 +220,7 @@ def predict_room(
     room: RoomViews,
     *,
     scene_id: str,
-    score_threshold: float,
+    score_threshold: float | None,
     duplicate_iou: float | None,
     views_at_once: int | None = None,
     with_shapes: bool = True,
@@ -231,6 +232,7 @@ def predict_room(
         ``room.volumes.joint()``, on the CPU.
     """
     device = next(model.parameters()).device
+    score_threshold = model.score_threshold if score_threshold is None else score_threshold
     predictions = []
     for volume, center in enumerate(room.volumes.center):
         views = room.views_of(volume)

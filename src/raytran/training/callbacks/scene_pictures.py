@@ -18,9 +18,10 @@ from raytran.data.collate import collate_scenes
 from raytran.data.files import disk_full, finished_folder
 from raytran.data.images import decode_image
 from raytran.data.views import choose_even
+from raytran.heads.score_scaling import SCORE_THRESHOLD
 from raytran.model import inputs_of
 from raytran.pictures.scene_pictures import draw_scene
-from raytran.postprocess import DUPLICATE_IOU, SCORE_THRESHOLD, select_objects
+from raytran.postprocess import DUPLICATE_IOU, select_objects
 from raytran.structs import SceneBatch, ScenePrediction
 from raytran.training.lightning_module import Reconstruction
 from raytran.training.loggers import ContinuedMLFlow
