@@ -44,8 +44,8 @@ PREDICTIONS = Path("outputs") / "predictions"
 """Where results go if nothing else is said, each by the name of its scene."""
 
 ONLY_ROOMS = (
-    "these weights have seen generated rooms alone: in a real room expect some chairs and tables about where "
-    "they are, and furniture that is not there, at high scores too"
+    "these weights have seen generated rooms alone: in a real room expect most chairs and tables about where "
+    "they are, other furniture now and then, and some that is not there"
 )
 
 _UNTRAINED = {
