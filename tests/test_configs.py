@@ -10,6 +10,7 @@ import re
 from datetime import timedelta
 
 import pytest
+import yaml
 from hydra.utils import instantiate
 from omegaconf import OmegaConf
 
@@ -253,6 +254,16 @@ def test_switches_are_read():
         "auto",
         "none",
     )
+
+
+def test_no_plain_setting_has_the_name_of_a_group(project_root):
+    """Hydra takes ``name=value`` for a choice where ``conf/name`` is a folder, and refuses it otherwise."""
+    conf = project_root / "conf"
+    for path in conf.glob("*.yaml"):
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        plain_keys = [key for key, value in content.items() if not isinstance(value, dict | list)]
+        same = [key for key in plain_keys if (conf / key).is_dir()]
+        assert not same, f"{path}: {same[0]}= cannot be typed"
 
 
 def settings_of_all_commands(project_root):

@@ -84,6 +84,7 @@ def test_a_verb_is_its_command(tmp_path):
         ("raytran ", set(VERBS)),
         ("raytran pre", {"predict", "prepare"}),
         ("raytran demo pres", {"preset="}),
+        ("raytran demo preset=", {f"preset={name}" for name in ("laptop", "raytran", "small", "tiny")}),
         ("raytran plan preset=", {f"preset={name}" for name in ("laptop", "raytran", "small", "tiny")}),
     ],
 )

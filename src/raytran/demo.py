@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from raytran.run.entry import entry_point
+from raytran.run.entry import entry_point, typed_settings
 
 if TYPE_CHECKING:
     from omegaconf import DictConfig
@@ -15,9 +15,11 @@ if TYPE_CHECKING:
 def main(cfg: DictConfig) -> None:
     """Run the command."""
     # Imported here so that --help answers at once.
+    from hydra.core.hydra_config import HydraConfig
+
     from raytran.run.demo.demo import demo
 
-    demo(cfg)
+    demo(cfg, typed_settings(HydraConfig.get()))
 
 
 if __name__ == "__main__":

@@ -364,11 +364,12 @@ def test_path_settings_are_settings(command):
     chosen = {
         "train": ["preset=tiny", "debug=profiler"],
         "curriculum": ["preset=tiny", "debug=profiler"],
+        "demo": ["debug=profiler"],
         "evaluate": ["preset=tiny"],
         "plan": ["preset=tiny"],
     }.get(command, [])
     names = [name for name in PATH_SETTINGS[command] if not (command == "plan" and name.startswith("data."))]
-    for logger in ("many", "mlflow") if command in ("train", "curriculum") else (None,):
+    for logger in ("many", "mlflow") if command in ("train", "curriculum", "demo") else (None,):
         others = (
             () if logger is None else ("logger.mlflow.",) if logger == "many" else ("logger.t", "logger.w")
         )

@@ -48,7 +48,7 @@ PATH_SETTINGS = {
     "poses": ("video", "output"),
     "plan": ("scene", "model.backbone.encoder.weights"),
     "view": ("folder",),
-    "demo": ("output",),
+    "demo": ("output", *_OF_TRAINING),
 }
 """Command → those of its settings that are paths."""
 

@@ -51,6 +51,9 @@ _SEVERAL_VALUES = re.compile(r"Ambiguous value for argument '(.*)'$", re.DOTALL)
 _UNKNOWN = re.compile(r"Could not override '(.*)'$")
 """How Hydra begins to say that there is no such setting."""
 
+_NO_CHOICE = re.compile(r"Could not override '([^']*)'\. No match in the defaults list$")
+"""How Hydra begins to say that a command does not choose from a folder of configs that is there."""
+
 _MOST_SUGGESTIONS = 3
 
 _ELSEWHERE = {
@@ -91,6 +94,8 @@ def no_such_setting(
     if unknown := _UNKNOWN.match(first_line(error)):
         meant = _similar_settings(unknown[1], known)
         return ConfigError(f"there is no setting {unknown[1]}: {_question(meant) or '--help lists all'}")
+    if no_choice := _NO_CHOICE.match(first_line(error)):
+        return ConfigError(f"this command takes no {no_choice[1]}=: --help lists what it takes")
     if isinstance(error, MissingConfigException) and error.options:
         group, _, name = str(error.missing_cfg_file).rpartition("/")
         meant = get_close_matches(name, error.options, n=1, cutoff=0.5)

@@ -191,6 +191,21 @@ def test_a_part_first_then_the_rest(released, prepare, digests, tmp_path):
     assert digests(out) == digests(tmp_path / "whole")
 
 
+def test_a_recording_may_go_once_its_scan_is_prepared(released, prepare, digests, tmp_path):
+    """So the whole of ScanNet, a terabyte, need never be there at once."""
+    prepare(released, tmp_path / "whole")
+    stored = (released / "scannet" / "scans").rename(tmp_path / "stored")
+    for scan in sorted(stored.iterdir()):
+        shutil.rmtree(released / "scannet" / "scans", ignore_errors=True)
+        shutil.copytree(scan, released / "scannet" / "scans" / scan.name)
+        prepare(released, tmp_path / "out")
+    whole, parts = digests(tmp_path / "whole"), digests(tmp_path / "out")
+    reports = {"report.txt", "report.json"}  # that of the parts names scans that are prepared and not there
+    assert {name: whole[name] for name in whole.keys() - reports} == {
+        name: parts[name] for name in parts.keys() - reports
+    }
+
+
 def test_other_settings_are_refused(released, prepare, digests, tmp_path):
     out = tmp_path / "out"
     prepare(released, out)

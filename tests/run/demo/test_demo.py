@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from raytran.checkpoints.file import shipped_weights, write_checkpoint
 from raytran.checkpoints.metadata import checkpoint_metadata
@@ -35,10 +35,13 @@ FEW = [
 ]
 
 
-def config(output, *more: str) -> DictConfig:
-    values = {"preset": "tiny", "overrides": [*FEW, *more], "score_threshold": 0.5, "duplicate_iou": 0.25}
-    learned = {"stage1": 0.0, "stage2": 0.999, "stage3": None}
-    return OmegaConf.create({"output": str(output), "validate_every": 1, "learned": learned, **values})
+OWN = ["validate_every=1", "learned.stage1=0.0", "learned.stage3=null"]
+
+
+def run(output, *more):
+    """Run the demo as the command line does."""
+    typed = [f"output={output}", "preset=tiny", *OWN, *FEW, *more]
+    return demo(compose("demo", typed), typed)
 
 
 def test_a_network_of_ones_own_is_trusted_because_it_was_typed(tmp_path, mylab):
@@ -62,14 +65,42 @@ def test_two_demos_in_one_folder(tmp_path):
         exclusive_lock(output / ".demo.lock", if_taken=ConfigError),
         pytest.raises(ConfigError, match=r"another process makes the demo in .*demo \(number"),
     ):
-        demo(config(output))
+        run(output)
+
+
+@pytest.mark.parametrize(
+    ("typed", "preset", "steps"),
+    [((), "tiny", 600), (("preset=laptop",), "laptop", 9000), (("schedule.stage2.steps=7",), "tiny", 7)],
+)
+def test_settings_of_a_training_can_be_typed(tmp_path, command, typed, preset, steps):
+    shown = command("demo", *typed, "--cfg", "job", folder=tmp_path)
+    assert shown.returncode == 0, shown.stderr
+    cfg = OmegaConf.create(shown.stdout)
+    assert (cfg.preset, cfg.schedule.stage2.steps) == (preset, steps)
+
+
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        (["preset=lapto"], "there is no preset=lapto: is preset=laptop meant?"),
+        (["preset=laptop", "nope=1"], "there is no setting nope"),
+        (["preset=laptop", "experiment=stage1"], "the demo decides experiment= itself"),
+        (["data.root=rooms"], "the demo decides data.root= itself"),
+    ],
+)
+def test_what_a_demo_does_not_take_is_one_sentence(tmp_path, command, typed, said):
+    done = command("demo", *typed, folder=tmp_path)
+    assert done.returncode == 1
+    (sentence,) = done.stderr.splitlines()
+    assert said in sentence
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow
 def test_demo_from_nothing_to_a_page_and_again(tmp_path, caplog, capsys):
     caplog.set_level("INFO")
     output = tmp_path / "demo"
-    first = demo(config(output))
+    first = run(output)
     assert list(first.metrics) == ["train", "val", "shipped"][: 2 if shipped_weights() is None else 3]
     assert first.page.read_text().count("<figure") == len(first.metrics) * 5 + 1
     assert str(first.page) in capsys.readouterr().out.replace("\n", "")
@@ -86,15 +117,13 @@ def test_demo_from_nothing_to_a_page_and_again(tmp_path, caplog, capsys):
     assert first.metrics["train"]["strict"]["n_scenes"] == 1
     assert set(first.seconds) >= {"rooms", "training, stage1", "training, stage3", "evaluation", "prediction"}
 
-    again = demo(config(output))
+    again = run(output)
     assert checkpoint.stat().st_mtime_ns == trained, "finished stages are not trained again"
     assert again.metrics == first.metrics
     assert again.seconds["training, stage1"] == first.seconds["training, stage1"]
     assert "finished already" in caplog.text
 
     with pytest.raises(ConfigError, match="other settings"):
-        demo(config(output, "schedule.stage2.steps=3"))
-    other = config(output)
-    other.learned.stage2 = 0.5
+        run(output, "schedule.stage1.learning_rate=1e-4")
     with pytest.raises(ConfigError, match="other settings"):
-        demo(other)
+        run(output, "learned.stage2=0.5")

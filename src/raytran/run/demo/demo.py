@@ -51,6 +51,12 @@ _SETTINGS = (
 )
 """All targets that are measured, and the views that a prediction takes."""
 
+_OWN = ("output", "preset", "validate_every", "learned", "score_threshold", "duplicate_iou")
+"""Settings that a demo reads itself; the others are those of a training."""
+
+_DECIDED = ("experiment", "stage", "init_from", "resume", "output_dir", "outputs", "data.root", "rooms.make")
+"""Settings of a training that a demo decides."""
+
 
 @dataclass(frozen=True)
 class Evaluated:
@@ -86,28 +92,49 @@ class DemoResult:
     seconds: Mapping[str, float]
 
 
-def demo(cfg: DictConfig) -> DemoResult:
+def demo(cfg: DictConfig, typed: Sequence[str]) -> DemoResult:
     """Run ``raytran demo``; see ``conf/demo.yaml``.
 
     Rooms and stages that an earlier run in the same folder finished are kept, an interrupted stage goes on;
     what follows from them takes seconds and is made anew.
 
+    Args:
+        cfg: settings of the command.
+        typed: those that were typed, as they were: those of a training hold for every stage.
+
     Raises:
-        ConfigError: the folder holds a demo with other settings.
+        ConfigError: the folder holds a demo with other settings, or one is typed that a demo decides.
     """
     output = Path(cfg.output).resolve()
+    settings = _of_training(typed)
 
     def taken(who: str) -> ConfigError:
         return ConfigError(f"another process makes the demo in {output} ({who}): wait, or give output=")
 
     with exclusive_lock(output / _LOCK, if_taken=taken):
-        return _demo(cfg, output)
+        return _demo(cfg, settings, output)
 
 
-def _demo(cfg: DictConfig, output: Path) -> DemoResult:
+def _of_training(typed: Sequence[str]) -> list[str]:
+    """Return those of the settings typed that are a training's, but for its preset.
+
+    Raises:
+        ConfigError: one is typed that a demo decides.
+    """
+    found = []
+    for word in typed:
+        key = word.partition("=")[0].lstrip("+~")
+        if key in _DECIDED:
+            raise ConfigError(f"the demo decides {key}= itself: leave it out, or use raytran curriculum")
+        if key.partition(".")[0] not in _OWN:
+            found.append(word)
+    return found
+
+
+def _demo(cfg: DictConfig, settings: Sequence[str], output: Path) -> DemoResult:
     """Make the demo in a folder that nobody else writes."""
     rooms = [f"data.root={quoted(output / 'rooms')}", "rooms.make=true"]
-    overrides = [f"preset={cfg.preset}", *rooms, *plain(cfg.overrides)]
+    overrides = [f"preset={cfg.preset}", *rooms, *settings]
     data = _data(cfg, overrides, output)
     times = StepTimes(output / "times.json")
     with times.measure("rooms", continues=True):
@@ -135,7 +162,7 @@ def _data(demo_cfg: DictConfig, overrides: Sequence[str], output: Path) -> Scene
         name: value if isinstance(value := cfg[name], str | int) else plain(value) for name in _RECORDED
     }
     wanted["rooms"] = {name: value for name, value in plain(cfg.rooms).items() if name != "make"}
-    wanted |= {name: plain(demo_cfg)[name] for name in ("validate_every", "learned")}
+    wanted |= {"validate_every": demo_cfg.validate_every, "learned": plain(demo_cfg.learned)}
     if SettingsRecord(output / _RECORD).begin(wanted):
         raise ConfigError(
             f"{output} holds a demo with other settings: delete it or give output=ANOTHER_FOLDER"
