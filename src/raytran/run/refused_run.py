@@ -14,16 +14,16 @@ from raytran.errors import RaytranError
 
 _BEFORE_TRAINING = {
     *("train.log", "curriculum.log", ".lock", "config.yaml", "provenance.json", "curriculum.json"),
-    *("hydra.yaml", "overrides.yaml"),
+    *("hydra.yaml", "overrides.yaml", "multirun.yaml", "sweep.json"),
 }
-"""Files of a run in which no step was taken."""
+"""Files of a run in which no step was taken, or of a sweep in which no job began."""
 
 
 def remove_refused_run(folder: Path, *, outputs: Path) -> None:
     """Remove the folder of a run in which nothing has been done, and those above it that are empty then.
 
     Args:
-        folder: of the run; left as it is if it holds anything of value, or if another process works in it.
+        folder: of the run or sweep; left as it is if it holds anything of value, or if another process works in it.
         outputs: top folder of all runs, the last to be removed.
     """
     is_first_rank = all(os.environ.get(name, "0") == "0" for name in ("RANK", "LOCAL_RANK", "SLURM_PROCID"))

@@ -25,6 +25,7 @@ from raytran.checkpoints.runs import one_at_a_time, read_finished
 from raytran.checkpoints.sweeps import RECORD, differences, read_record
 from raytran.errors import ConfigError, RaytranError
 from raytran.run.entry import typed_settings, user_environment
+from raytran.run.refused_run import remove_refused_run
 from raytran.run.sweep.faults import no_parent, said_by_all
 from raytran.run.sweep.folder import THIS_SWEEP, own_settings, write_record
 from raytran.run.sweep.job import CONSOLE, FAILED, FINISHED, STOPPED, Job
@@ -81,12 +82,14 @@ def launch(
         jobs = _jobs(config, loader, job_overrides, folder)
         gpus = _gpus() if any(job.config.trainer.accelerator != "cpu" for job in jobs) else []
         refused = no_parent(jobs)
-        if refused is not None:
-            raise refused
-        typed = [str(item) for item in config.hydra.overrides.hydra]
-        general = [item for item in typed if not item.lstrip("+~").startswith(_OF_SWEEPS)]
-        stopped_by = run_jobs(jobs, gpus, general, lock, limit=_limit(parallel, jobs, gpus))
-        values = write_results(folder, jobs)
+        if refused is None:
+            typed = [str(item) for item in config.hydra.overrides.hydra]
+            general = [item for item in typed if not item.lstrip("+~").startswith(_OF_SWEEPS)]
+            stopped_by = run_jobs(jobs, gpus, general, lock, limit=_limit(parallel, jobs, gpus))
+            values = write_results(folder, jobs)
+    if refused is not None:
+        remove_refused_run(folder, outputs=Path(jobs[0].config.outputs))
+        raise refused
     if stopped_by:
         _log.info("stopped; the same command goes on with this sweep")
         raise SystemExit(128 + stopped_by)
