@@ -23,7 +23,8 @@ def remove_refused_run(folder: Path, *, outputs: Path) -> None:
     """Remove the folder of a run in which nothing has been done, and those above it that are empty then.
 
     Args:
-        folder: of the run or sweep; left as it is if it holds anything of value, or if another process works in it.
+        folder: of the run or sweep; left as it is if it holds anything of value, or if another process works
+            in it.
         outputs: top folder of all runs, the last to be removed.
     """
     is_first_rank = all(os.environ.get(name, "0") == "0" for name in ("RANK", "LOCAL_RANK", "SLURM_PROCID"))
