@@ -105,7 +105,6 @@ def test_headline():
         "F1 at IoU 0.25": "0.75",
         "F1 at IoU 0.5": "0.50",
         "occupancy IoU": "0.25",
-        "frames a room": "12",
     }
     assert headline(metrics(4) | {"shape": {"iou": 0.6}})["shape IoU"] == "0.60"
     assert headline(metrics(0) | {"shape": {"iou": None}})["shape IoU"] == "–"

@@ -71,7 +71,6 @@ def headline(metrics: Mapping[str, Any]) -> dict[str, str]:
     if "shape" in metrics:
         iou = metrics["shape"]["iou"]
         numbers["shape IoU"] = "–" if iou is None else f"{iou:.2f}"
-    numbers["frames a room"] = str(metrics["num_views"])
     return numbers
 
 
