@@ -88,3 +88,15 @@ def test_a_folder_removed_meanwhile_is_one_sentence(tmp_path):
 
     with pytest.raises(DataError, match="deep was removed while result was written"):
         write()
+
+
+def test_what_ends_before_it_has_written_leaves_no_folder(tmp_path):
+    (tmp_path / "kept").mkdir()
+    for place in (tmp_path / "kept" / "a" / "b", tmp_path / "outputs" / "evaluations" / "now"):
+        with pytest.raises(ConfigError), one_writer(place, marker="metrics.json"):
+            raise ConfigError("there are no rooms")
+    assert [path.name for path in tmp_path.iterdir()] == ["kept"]
+    assert not list((tmp_path / "kept").iterdir())
+    with one_writer(tmp_path / "outputs" / "now", marker="metrics.json"):
+        (tmp_path / "outputs" / "now").mkdir()
+    assert (tmp_path / "outputs" / "now").is_dir()

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,6 +35,8 @@ def check_replaceable(folder: Path, *, marker: str) -> None:
 def one_writer(folder: Path, *, marker: str) -> Iterator[None]:
     """Keep other commands from writing a folder of results until the block ends or this process dies.
 
+    Folders above it that are made for this, and are empty when the block raises, are removed.
+
     Args:
         folder: the final name; it need not exist.
         marker: see ``replaced_folder``.
@@ -52,8 +55,15 @@ def one_writer(folder: Path, *, marker: str) -> Iterator[None]:
     name = folder.name
     if len(name) > _LONGEST_NAME:
         name = hashlib.sha256(name.encode(errors="surrogateescape")).hexdigest()
-    with exclusive_lock(folder.with_name(f".{name}.lock"), if_taken=taken):
-        yield
+    new = [above for above in folder.parents if not above.exists()]
+    try:
+        with exclusive_lock(folder.with_name(f".{name}.lock"), if_taken=taken):
+            yield
+    except BaseException:
+        with contextlib.suppress(OSError):  # the first that holds something ends it
+            for above in new:
+                above.rmdir()
+        raise
 
 
 @contextmanager

@@ -23,7 +23,7 @@ def remove_refused_run(folder: Path, *, outputs: Path) -> None:
     """Remove the folder of a run in which nothing has been done, and those above it that are empty then.
 
     Args:
-        folder: of the run or sweep; left as it is if it holds anything of value, or another process works
+        folder: of the run or sweep; left as it is if it holds anything of value, or if another process works
             in it.
         outputs: top folder of all runs, the last to be removed.
     """
