@@ -299,9 +299,7 @@ class RayTran(nn.Module):
 
         Where scores are scaled it is another number and chooses the same objects.
         """
-        if self.score_scaling is None:
-            return SCORE_THRESHOLD
-        return float(self.score_scaling(torch.tensor(SCORE_THRESHOLD, dtype=torch.float64)))
+        return SCORE_THRESHOLD if self.score_scaling is None else self.score_scaling.of_half
 
     @torch.no_grad()
     def predict(

@@ -9,16 +9,18 @@ import reading
 def test_a_training_step_goes_through_few_files():
     found = reading.training_step()
     assert {"model.py", "backbone/block.py", "ops/ray_attention.py", "losses/total.py"} <= set(found.files)
-    assert len(found.files) <= 21
-    assert found.changes <= 105  # twenty of them enter a norm in the precision of its input
+    assert (
+        len(found.files) <= 22
+    )  # one of them says where float64 is computed, for Apple's GPUs, which have none
+    assert found.changes <= 110  # twenty of them enter a norm in the precision of its input
 
 
 def test_a_prediction_goes_through_few_files():
     found = reading.prediction()
     assert {"model.py", "backbone/block.py", "heads/shape.py"} <= set(found.files)
     assert not any(name.startswith(("training/", "losses/")) for name in found.files)
-    assert len(found.files) <= 20
-    assert found.changes <= 130  # a dozen of them check the views, twenty enter a norm
+    assert len(found.files) <= 21
+    assert found.changes <= 140  # a dozen of them check the views, twenty enter a norm
 
 
 def test_what_is_counted(tmp_path, monkeypatch):

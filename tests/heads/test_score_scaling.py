@@ -56,6 +56,9 @@ def test_certainty_stays_and_one_after_another_is_one():
     assert torch.allclose(both(score), then(first(score)))
     assert both(score)[[0, -1]].tolist() == [0.0, 1.0]
     assert then.after(None) == then
+    assert [one.of_half for one in (first, then)] == [
+        pytest.approx(one(score)[2].item()) for one in (first, then)
+    ]
 
 
 def test_settings_are_checked():

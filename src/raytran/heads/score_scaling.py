@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -55,6 +56,11 @@ class ScoreScaling:
     def __call__(self, score: Tensor) -> Tensor:
         """Return the scaled scores; 0 stays 0, 1 stays 1."""
         return (self.scale * score.logit() + self.offset).sigmoid()
+
+    @property
+    def of_half(self) -> float:
+        """The score of a probability of ½, whose log odds are 0."""
+        return 1 / (1 + math.exp(-self.offset))
 
     def after(self, first: ScoreScaling | None) -> ScoreScaling:
         """Return the one scaling that does what ``first`` and then this one do."""
