@@ -4,6 +4,7 @@ from __future__ import annotations
 from itertools import islice
 from types import SimpleNamespace
 
+import lightning.pytorch as pl
 import pytest
 import torch
 
@@ -139,3 +140,36 @@ def test_data_are_made_where_they_are_read(monkeypatch, tmp_path):
 def test_validation_scenes_come_one_by_one(monkeypatch, tmp_path):
     """So that losses, means over scenes, are the same for any batch size and any number of ranks."""
     assert list(make_data(monkeypatch, tmp_path, batch_size=2).val_dataloader()) == [[i] for i in range(5)]
+
+
+@pytest.mark.filterwarnings("ignore:`training_step` returned", "ignore:You passed in a `val_dataloader`")
+def test_the_trainer_is_given_the_scenes_of_every_root(room, tmp_path):
+    class Counted(pl.LightningModule):
+        def training_step(self, batch, index):
+            seen.append(batch.scene_id[0])
+
+        def configure_optimizers(self):
+            return torch.optim.SGD([torch.nn.Parameter(torch.zeros(1))])
+
+    words = ["preset=tiny", "data=scan2cad", f"data.root={room}", f"output_dir={tmp_path}"]
+    words += ["stage.targets=[objects]", "views.num_workers=0"]
+    trainer = pl.Trainer(
+        accelerator="cpu",
+        limit_train_batches=2,
+        max_epochs=1,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+    )
+    seen: list[str] = []
+    data = build_data(compose("train", [*words, f"data.more_roots=[{room}]"]))
+    trainer.fit(Counted(), datamodule=data)
+    assert len(seen) == len(trainer.train_dataloader.dataset) == 2
+    assert (
+        len(build_data(compose("train", words)).split("train", training=True))
+        == len(data.split("train"))
+        == 1
+    )
+    missing = build_data(compose("train", [*words, f"data.more_roots=[{tmp_path / 'absent'}]"]))
+    with pytest.raises(DataError, match=r"there is no folder .*absent"):
+        missing.train_dataloader()
